@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from agents.agent import Agent, pretrained
     from agents.agent_file import AgentError, pretrained_folder
     from agents.algorithms import AppliedActionBuffer
-    from agents.callbacks import DualAscentCallback, EvaluationCallback, SafetyCallback
+    from agents.callbacks import DualAscentCallback, SafetyCallback
     from agents.evaluation import evaluate
     from agents.hyperparams import tuned_hyperparams, tuned_steps
     from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
@@ -32,7 +32,6 @@ __all__ = [
     "DualAscentCallback",
     "Episode",
     "Evaluation",
-    "EvaluationCallback",
     "LagrangianSettings",
     "LoopConfig",
     "SB3VecEnv",
@@ -54,7 +53,7 @@ __all__ = [
 _MODULES = {
     "agent": ("Agent", "pretrained"),
     "algorithms": ("AppliedActionBuffer",),
-    "callbacks": ("DualAscentCallback", "EvaluationCallback", "SafetyCallback"),
+    "callbacks": ("DualAscentCallback", "SafetyCallback"),
     "loop": ("LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "hyperparams": ("tuned_hyperparams", "tuned_steps"),

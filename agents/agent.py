@@ -19,23 +19,53 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.agent_file import (
-    AgentError,
-    document_of,
-    pretrained_folder,
-    read_files,
-    shield_from_json,
-    shield_to_json,
-)
-from agents.algorithms import algorithm_class, build_model
+from agents.agent_file import AgentError, pretrained_folder, read_files
+from agents.algorithms import build_model
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig, ShieldSettings
-from agents.normalization import Normalization
 from agents.sb3_vec_env import SB3VecEnv
 from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import to_json
+from ncs_gym.reading import json_values
 from ncs_gym.validation import reason_of, shown
 from shields.atomic_write import write_atomically
+from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
+
+_FORMAT = "ncs-gym agent 3"
+
+
+@dataclass(frozen=True, eq=False)
+class Normalization:
+    """Normalizes observations: clip((o - mean) / sqrt(variance + epsilon), -clip, clip).
+
+    Attributes:
+        mean: Mean of the observations in training, shape (entries,).
+        variance: Their variance, shape (entries,).
+        epsilon: Keeps the root away from 0.
+        clip: Largest absolute value of a normalized entry.
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    epsilon: float
+    clip: float
+
+    @classmethod
+    def of(cls, env: VecNormalize) -> Normalization:
+        """Returns the present statistics of a `VecNormalize`.
+
+        Raises:
+            TypeError: If its observations are dictionaries.
+        """
+        statistics = env.obs_rms
+        if isinstance(statistics, dict):
+            raise TypeError("observations must be one array, got a dictionary of them")
+        return cls(statistics.mean.copy(), statistics.var.copy(), float(env.epsilon), float(env.clip_obs))
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Returns normalized observations (N, entries), float32."""
+        scaled = (observations - self.mean) / np.sqrt(self.variance + self.epsilon)
+        return np.clip(scaled, -self.clip, self.clip).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -44,15 +74,14 @@ class Agent:
 
     Attributes:
         algorithm: Name of the algorithm in `agents.hyperparams.ALGORITHMS`.
-        hyperparams: Hyperparameters the agent was trained with, JSON values by name; empty for one of `load_sb3_zip`.
+        hyperparams: Hyperparameters the agent was trained with, JSON values by name.
         env: Id of the environment the agent was trained in.
         channel: Channel the agent was trained with; None for that of the id.
         model: The stable-baselines3 model.
         normalization: Normalization of the model's observations.
-        seed: Seed of the training; None where it is not known.
+        seed: Seed of the training.
         shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
         horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
-        is_filtered: Whether it was trained behind another filter (`LoopConfig.filter`), which files do not keep.
         kwargs: Other keyword arguments of the environment that it was trained in, JSON values where it is to be saved.
     """
 
@@ -65,7 +94,6 @@ class Agent:
     seed: int | None = None
     shield_mode: str | None = None
     horizon: int | None = None
-    is_filtered: bool = False
     kwargs: dict[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -130,22 +158,20 @@ class Agent:
         """Returns the contents of `model.zip`, in stable-baselines3's format, and of `agent.json`, with the rest.
 
         Raises:
-            ValueError: If the environment was made with something that a file does not keep, or the agent is from a
-                zip of stable-baselines3.
+            ValueError: If the environment was made with something that a file does not keep.
         """
-        if not self.hyperparams:
-            raise ValueError("the agent is from a zip of stable-baselines3, which is its file: save agent.model")
         require_kept(self.kwargs, self.env)
         buffer = io.BytesIO()
         self.model.save(buffer)
         content = {
+            "format": _FORMAT,
             "env": self.env,
             "algorithm": self.algorithm,
             "seed": self.seed,
             "versions": _versions(),
             "hyperparams": self.hyperparams,
             "channel": to_json(self.channel),
-            "shield": shield_to_json(self.shield_mode, self.horizon),
+            "shield": self.shield_mode and {"mode": self.shield_mode, "horizon": self.horizon},
             "plant": None if (plant := _plant_of(self.env, self.kwargs)) is None else plant.fingerprint,
             "normalization": {
                 "mean": self.normalization.mean.tolist(),
@@ -155,11 +181,9 @@ class Agent:
             },
             "sha256_of_model": hashlib.sha256(buffer.getvalue()).hexdigest(),
         }
-        if self.is_filtered:
-            content["filtered"] = True
         if self.kwargs:
             content["kwargs"] = self.kwargs
-        return {"model.zip": buffer.getvalue(), "agent.json": document_of(content)}
+        return {"model.zip": buffer.getvalue(), "agent.json": (json.dumps(content, indent=1) + "\n").encode()}
 
     def save(self, folder: str | Path, shield: ShieldSettings | None = None) -> None:
         """Writes a folder that can be shared: `model.zip`, `agent.json`, and `certificate.json` of a shield.
@@ -192,13 +216,26 @@ class Agent:
             AgentError: If the files are missing, damaged, of another format or of an environment that has changed.
             ModuleNotFoundError: If a package that the algorithm or the environment needs is not installed.
         """
-        folder, content, weights = read_files(folder)
+        return cls.of_files(read_files(folder))
+
+    @classmethod
+    def of_files(cls, files: Mapping[str, bytes]) -> Agent:
+        """Returns the agent whose `files` these are; for errors see `load`."""
+        try:
+            content: Any = json_values(files["agent.json"])
+        except (ValueError, RecursionError) as error:
+            raise AgentError("the agent is damaged: its agent.json is not valid JSON") from error
+        if not isinstance(content, dict) or content.get("format") != _FORMAT:
+            raise AgentError(f"agent.json is not of format {_FORMAT!r}")
+        weights = files["model.zip"]
+        if hashlib.sha256(weights).hexdigest() != content.get("sha256_of_model"):
+            raise AgentError("model.zip is not the one that agent.json belongs to")
         try:
             return _rebuilt(content, weights)
         except (AgentError, ModuleNotFoundError):  # the second is nothing wrong with the files
             raise
         except Exception as error:  # a forged file may break any part of the libraries that read it
-            raise AgentError(f"the agent in {folder} is damaged: {reason_of(error)}") from error
+            raise AgentError(f"the agent is damaged: {reason_of(error)}") from error
 
 
 def pretrained(env_id: str) -> Agent:
@@ -257,14 +294,13 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         raise AgentError(f"the agent was trained on another plant than that of {env_id}: their fingerprints differ")
     hyperparams = complete_hyperparams(algorithm, content["hyperparams"])
     loop = LoopConfig(env=env_id, kwargs=kwargs | {"channel": content["channel"]})
-    shield_mode, horizon = shield_from_json(content.get("shield"))
+    shield = content["shield"] or {"mode": None, "horizon": None}
+    if shield["mode"] not in (None, *MODES) or shield["horizon"] not in (None, *range(1, LONGEST_HORIZON + 1)):
+        raise AgentError("the agent is damaged: there is no shield of that mode and horizon")
     envs = SB3VecEnv(loop.vector(2))
     numbers = content["normalization"]
     mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))
-    is_filtered = content.get("filtered", False) is not False
     if mean.ndim == 1 and mean.shape != envs.observation_space.shape:
-        if is_filtered:
-            raise AgentError("the agent was trained behind a filter that changed its observations: no file keeps it")
         raise AgentError(
             f"the agent saw observations of {len(mean)} entries, those of {env_id} have the shape "
             f"{envs.observation_space.shape} now: it is registered with another task or observe="
@@ -282,43 +318,9 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         model=model,
         normalization=Normalization(mean, variance, float(numbers["epsilon"]), float(numbers["clip"])),
         seed=content.get("seed"),
-        shield_mode=shield_mode,
-        horizon=horizon,
-        is_filtered=is_filtered,
+        shield_mode=shield["mode"],
+        horizon=shield["horizon"],
         kwargs=kwargs,
-    )
-
-
-def load_sb3_zip(path: Path, env_id: str, algorithm: str, vec_normalize: Path | None) -> Agent:
-    """Returns an agent that `model.save` wrote, by stable-baselines3's `load`: it unpickles, and so may run code.
-
-    Args:
-        path: The zip, from somebody whom you trust.
-        env_id: Id of the environment.
-        algorithm: Name of the algorithm in `agents.hyperparams.ALGORITHMS`.
-        vec_normalize: File that `VecNormalize.save` wrote, which is unpickled, too; None if the agent saw observations
-            as they are.
-
-    Raises:
-        AgentError: If a file cannot be read, is of another algorithm or environment, or the policy acts by more than
-            observations, such as a recurrent one.
-        ModuleNotFoundError: If the algorithm's package is not installed.
-    """
-    env = SB3VecEnv(LoopConfig(env=env_id).vector(2))
-    normalization = Normalization.none(int(np.prod(env.observation_space.shape or ())))
-    try:
-        model = algorithm_class(algorithm).load(path, env=env, device="cpu")
-        if vec_normalize is not None:
-            statistics = VecNormalize.load(str(vec_normalize), env)
-            normalization = Normalization.of(statistics) if statistics.norm_obs else normalization
-    except ModuleNotFoundError:
-        raise
-    except Exception as error:  # what is unpickled may raise any kind
-        raise AgentError(f"{path} does not load as an agent by {algorithm} in {env_id}: {reason_of(error)}") from error
-    if type(model.policy) is not model.policy_aliases["MlpPolicy"]:
-        raise AgentError(f"{path} has a {type(model.policy).__name__}, not the MlpPolicy of {algorithm}")
-    return Agent(
-        algorithm=algorithm, hyperparams={}, env=env_id, channel=None, model=model, normalization=normalization
     )
 
 
@@ -334,7 +336,7 @@ def _versions() -> dict[str, str]:
 # What an agent.json has: what else it says might be a part of the policy.
 _ENTRIES = {
     *("format", "env", "algorithm", "seed", "versions", "hyperparams", "kwargs", "channel", "plant", "shield"),
-    *("normalization", "filtered", "sha256_of_model"),
+    *("normalization", "sha256_of_model"),
 }
 # Settings of environments that files of agents keep, as JSON values; the channel has a place of its own.
 _KEPT = {

@@ -7,24 +7,21 @@ import importlib
 import importlib.util
 import inspect
 from collections.abc import Mapping
-from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any
 
 import numpy as np
-import torch
 from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
-from torch import nn
 from torch.nn.modules import activation
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
 from agents.sb3_vec_env import INFO_KEYWORDS
 from ncs_gym.installation import install_command
-from ncs_gym.validation import reason_of, shown
+from ncs_gym.validation import as_number, reason_of, shown
 
 # Arguments of the library that are no hyperparameters: they are given here.
 _NO_HYPERPARAMS = ("policy", "env", "venv", "action_noise", "tensorboard_log", "verbose", "seed", "device")
@@ -57,7 +54,7 @@ def normalized_env(name: str, env: VecEnv, hyperparams: Mapping[str, Any]) -> Ve
     arguments = {} if normalize is True else normalize
     if not isinstance(arguments, dict) or not arguments.get("norm_obs", True):
         raise ValueError(f"{name}: normalize must be true or have arguments of VecNormalize, got {shown(normalize)}")
-    _require_fitting(VecNormalize, arguments, f"{name}: normalize: ")
+    _require_known(VecNormalize, arguments, f"{name}: normalize: ")
     return VecNormalize(env, **{"gamma": hyperparams["gamma"], **arguments})
 
 
@@ -92,14 +89,14 @@ def _not_the_librarys(name: str) -> tuple[str, ...]:
 def _arguments(
     name: str, cls: type[BaseAlgorithm], env: VecEnv, hyperparams: Mapping[str, Any], steps: int
 ) -> dict[str, Any]:
-    """Returns the arguments of the constructor; raises ValueError if a hyperparameter is unknown or of a wrong type."""
+    """Returns the arguments of the constructor; raises ValueError if a hyperparameter is unknown."""
     own: dict[str, Any] = {
         key: copy.deepcopy(value) for key, value in hyperparams.items() if key not in _not_the_librarys(name)
     }
     for key, value in own.items():
         if isinstance(value, str) and value.startswith(_LINEAR):
             own[key] = _falling(float(value.removeprefix(_LINEAR)), name, env, hyperparams, steps)
-    _require_fitting(cls, own)
+    _require_known(cls, own)
     if isinstance(given := own.get("policy_kwargs"), dict):
         own["policy_kwargs"] = policy_arguments(given)
     if name in ON_POLICY and "batch_size" in own:
@@ -111,9 +108,7 @@ def _arguments(
     if stored == "applied":
         own["replay_buffer_class"] = AppliedActionBuffer
     if (deviation := hyperparams.get("noise_std")) is not None:
-        if not _fits(deviation, float) or not 0.0 <= deviation < float("inf"):
-            raise ValueError(f"noise_std must be >= 0, got {shown(deviation)}")
-        size = flatdim(env.action_space)
+        deviation, size = as_number(deviation, "noise_std", low=0.0), flatdim(env.action_space)
         own["action_noise"] = NormalActionNoise(np.zeros(size), deviation * np.ones(size))
     return own | {"policy": "MlpPolicy"}
 
@@ -122,22 +117,15 @@ def policy_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the hyperparameter `policy_kwargs` as policies take it: with the class of its activation function.
 
     Raises:
-        ValueError: If torch has no activation function of that name, or one that changes the number of entries.
+        ValueError: If torch has no activation function of that name.
     """
     found, name = dict(given), given.get("activation_fn")
     if name is not None:
         own = str(name).removeprefix("nn.")
-        if own not in activation.__all__ or not _keeps_entries(getattr(activation, own)):
-            raise ValueError(f"policy_kwargs: torch.nn has no activation function {shown(name)} of single numbers")
+        if own not in activation.__all__:
+            raise ValueError(f"policy_kwargs: torch.nn has no activation function {shown(name)}")
         found["activation_fn"] = getattr(activation, own)
     return found
-
-
-def _keeps_entries(function: type[nn.Module]) -> bool:
-    try:
-        return function()(torch.zeros(3, 4)).shape == (3, 4)
-    except (RuntimeError, TypeError, ValueError):  # of images, or of what is more than a function
-        return False
 
 
 def _falling(rate: float, name: str, env: VecEnv, hyperparams: Mapping[str, Any], steps: int) -> LinearSchedule:
@@ -154,27 +142,11 @@ def _parameters(cls: type) -> Mapping[str, inspect.Parameter]:
     return inspect.signature(cls).parameters
 
 
-def _require_fitting(cls: type, arguments: Mapping[str, Any], prefix: str = "") -> None:
-    """Raises ValueError if a class of the library has no such argument, or says that it is of another type.
-
-    Its constructors rarely look: a text for a number would come to light only when the first rollout is over.
-    """
-    for name, value in arguments.items():
+def _require_known(cls: type, arguments: Mapping[str, Any], prefix: str = "") -> None:
+    """Raises ValueError if a class of the library has no such argument, or it is given here."""
+    for name in arguments:
         if name not in _parameters(cls) or name in _NO_HYPERPARAMS:
             raise ValueError(f"{prefix}unknown hyperparameter {shown(name)}")
-        if not _fits(value, _parameters(cls)[name].annotation):
-            raise ValueError(f"{prefix}{name} cannot be {shown(value)}")
-
-
-def _fits(value: Any, annotation: Any) -> bool:
-    """Returns whether a value has a type that an annotation names; True if it names none."""
-    is_union = get_origin(annotation) in (Union, UnionType)
-    kinds = [get_origin(each) or each for each in (get_args(annotation) if is_union else (annotation,))]
-    if not all(isinstance(each, type) for each in kinds):
-        return True
-    if isinstance(value, bool):
-        return bool in kinds
-    return isinstance(value, (*kinds, int) if float in kinds else tuple(kinds))
 
 
 # The info that says what was applied: behind a downlink what was decided, to be applied later.
@@ -188,14 +160,13 @@ class AppliedActionBuffer(ReplayBuffer):
 
     Hand it to SAC, TD3 and their kind as `replay_buffer_class`, and its infos to
     `SB3VecEnv(info_keywords=AppliedActionBuffer.info_keywords)`. `train` does so with the hyperparameter
-    `stored_action="applied"`. It is for returns of one step (`n_steps=1`).
+    `stored_action="applied"`. It is for returns of one step (`n_steps=1`), and for actions of one control step.
 
     Attributes:
         info_keywords: The infos that it reads, and those that `SB3VecEnv` has at every step anyway.
     """
 
-    info_keywords = (*INFO_KEYWORDS, APPLIED, "episode_steps")
-    _steps: np.ndarray | None = None  # of the episodes, when the last transition was added
+    info_keywords = (*INFO_KEYWORDS, APPLIED)
 
     def add(
         self,
@@ -209,34 +180,20 @@ class AppliedActionBuffer(ReplayBuffer):
         """Adds a transition of every environment.
 
         Raises:
-            ValueError: If infos do not say what was applied, actions have entries that are no inputs, something but the
-                shield changes them, or an action takes several steps.
+            ValueError: If infos do not say what was applied, or something but the shield changes actions.
         """
-        missing = [name for name in (APPLIED, "episode_steps") if any(name not in info for info in infos)]
-        if missing:
+        if not all(APPLIED in info for info in infos):
             raise ValueError(
-                f'infos have no "{missing[0]}": the buffer is for environments of ncs_gym, in '
+                f'infos have no "{APPLIED}": the buffer is for environments of ncs_gym, in '
                 "SB3VecEnv(envs, info_keywords=AppliedActionBuffer.info_keywords)"
             )
         applied = np.array([info[APPLIED] for info in infos])
-        if applied.shape != action.shape:
-            raise ValueError(
-                f'"{APPLIED}" has the shape {applied.shape}, actions have {action.shape}: a wrapper adds entries to '
-                "them or makes them discrete, which the buffer cannot store"
-            )
         passed = np.array([not info.get("shield_intervened", False) for info in infos])
-        if not np.allclose(applied[passed], action[passed].clip(-1.0, 1.0), atol=_SAME_ACTION):
+        if applied.shape != action.shape or not np.allclose(
+            applied[passed], action[passed].clip(-1.0, 1.0), atol=_SAME_ACTION
+        ):
             raise ValueError(
                 f'"{APPLIED}" is not the action of the agent, although nothing overrode it: a wrapper outside the '
                 "shield changes actions, and the buffer cannot say which of the agent's stands for what was applied"
             )
-        steps = np.array([info["episode_steps"] for info in infos])
-        before = steps - 1 if self._steps is None else self._steps
-        if not ((steps == before + 1) | (steps == 1)).all():
-            raise ValueError(
-                "an action of the agent takes several steps of the environment (action repeat, frame skipping), of "
-                f'which "{APPLIED}" says the last action alone, and the buffer cannot store them as one; or something '
-                "else has stepped the environment between two transitions"
-            )
-        self._steps = steps
         super().add(obs, next_obs, applied.astype(action.dtype), reward, done, infos)

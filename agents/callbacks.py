@@ -1,4 +1,4 @@
-"""What happens beside the learning: violations are counted, their price is adapted, and the policy is evaluated."""
+"""What happens beside the learning: violations are counted, and their price is adapted."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from agents.evaluation import evaluate
-from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
+from agents.loop import CostPenalty, LagrangianSettings
 from agents.results import TrainingPoint
 from agents.sb3_vec_env import INFO_KEYWORDS, SB3VecEnv
 
@@ -18,8 +17,8 @@ from agents.sb3_vec_env import INFO_KEYWORDS, SB3VecEnv
 OTHERS = 'agents.train is for environments with "cost" in their infos: train others by stable-baselines3 itself'
 # The history has about this many points where every step of all environments is a rollout.
 _MAX_POINTS = 200
-# The policy is evaluated about this often.
-_EVALUATIONS = 10
+# An agent that is trained is kept about so often on the way.
+_TIMES = 10
 
 
 class SafetyCallback(BaseCallback):
@@ -153,20 +152,14 @@ class DualAscentCallback(BaseCallback):
 
 
 class RegularCallback(BaseCallback):
-    """Does something about ten times while an agent is trained, between rollouts.
+    """Does something about ten times while an agent is trained, between rollouts."""
 
-    Args:
-        act: Does it.
-        at_start: Whether the first time is before anything is learned.
-    """
-
-    def __init__(self, act: Callable[[], None], *, at_start: bool = False) -> None:
+    def __init__(self, act: Callable[[], None]) -> None:
         super().__init__()
-        self._act, self._at_start = act, at_start
+        self._act = act
 
     def _on_training_start(self) -> None:
-        self._interval = self.locals["total_timesteps"] / _EVALUATIONS
-        self._due = 0.0 if self._at_start else self._interval
+        self._due = self._interval = self.locals["total_timesteps"] / _TIMES
 
     def _on_rollout_start(self) -> None:
         if self.num_timesteps >= self._due:
@@ -175,44 +168,6 @@ class RegularCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
-
-
-class EvaluationCallback(RegularCallback):
-    """Evaluates the policy about every tenth part of the training, and once more at its end, and logs the results.
-
-    TensorBoard gets `eval/mean_reward` (mean return, without penalties), `eval/success_rate` (episodes without a
-    violation of the true state) and `eval/intervention_rate` (per step). The names of the first two are those of
-    stable-baselines3's `EvalCallback`. All evaluations use common random numbers, none of which are the training's:
-    what is learned is the same with and without this callback. The policy acts deterministically.
-
-    Args:
-        loop: The control loop to evaluate in.
-        seed: Seed of the evaluations.
-        episodes: Episodes of each evaluation, played side by side.
-    """
-
-    def __init__(self, loop: LoopConfig, seed: int, episodes: int = 20) -> None:
-        super().__init__(self._evaluate, at_start=True)
-        self._loop, self._seed, self._episodes = loop, seed, episodes
-
-    def _on_training_end(self) -> None:
-        self._evaluate()
-
-    def _evaluate(self) -> None:
-        episodes = evaluate(self._loop, lambda seen, _: self._actions(seen), self._episodes, self._seed).episodes
-        steps = sum(episode.steps for episode in episodes)
-        safe = [episode.violation_steps == 0 for episode in episodes]
-        self.logger.record("eval/mean_reward", float(np.mean([episode.episode_return for episode in episodes])))
-        self.logger.record("eval/success_rate", float(np.mean(safe)))
-        self.logger.record("eval/intervention_rate", sum(episode.interventions for episode in episodes) / steps)
-        self.logger.dump(self.num_timesteps)
-
-    def _actions(self, observations: np.ndarray) -> np.ndarray:
-        """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries)."""
-        env = self.model.get_env()
-        if isinstance(env, VecNormalize):
-            observations = np.asarray(env.normalize_obs(observations))
-        return self.model.predict(observations, deterministic=True)[0]
 
 
 def _counted(callback: BaseCallback) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from difflib import get_close_matches
 from typing import Any
 
 import gymnasium as gym
@@ -14,11 +13,7 @@ from gymnasium.vector import SyncVectorEnv, VectorEnv, VectorWrapper
 
 from ncs_gym import Channel
 from ncs_gym.envs.json_settings import from_json, read_plant, to_json
-from ncs_gym.validation import (
-    AroundEnvironments,
-    as_number,
-    shown,
-)
+from ncs_gym.validation import AroundEnvironments, as_number, shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
 from shields.runtime.guarantee import LostGuarantee
 from shields.runtime.safety_filter import plan_horizon
@@ -109,12 +104,10 @@ class LoopConfig:
         try:
             gym.spec(self.env)
         except (gym.error.Error, ImportError, AttributeError) as error:
-            module, _, alone = self.env.rpartition(":") if isinstance(self.env, str) else ("", "", "")
-            known = list(gym.registry)
-            near = get_close_matches(alone, known, 1, 0.9) or get_close_matches(f"ncs_gym/{alone}", known, 1, 0.9)
-            way = f"did you mean {near[0]!r}?" if near else "import the module that registers it"
-            way = f"import {module}, and give {alone!r}" if module else way
-            raise ValueError(f"{shown(self.env)} is no registered environment: {way}") from error
+            raise ValueError(
+                f"{shown(self.env)} is no registered environment: import the module that registers it, and give the "
+                "id alone"
+            ) from error
         penalty = as_number(self.violation_penalty, "violation_penalty", low=0.0)
         object.__setattr__(self, "violation_penalty", penalty)
         if penalty and self.lagrangian is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -25,6 +24,8 @@ torch.set_num_threads(1)
 
 # Vector environments whose reset takes options={"reset_mask": ...} and resets only the environments in the mask.
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
+# Those whose environments are objects of their own.
+_OF_ENVIRONMENTS = (SyncVectorEnv, AsyncVectorEnv)
 # What gymnasium reports of ends of episodes, beside the infos of the next ones.
 _FINAL = ("final_obs", "final_info")
 # Infos that callbacks of the package and of others read at every step.
@@ -113,7 +114,7 @@ class SB3VecEnv(VecEnv):
                 'list, {"channel": [c_1, ..., c_N]}, or draw them with VectorRandomChannel'
             )
         seeds: Any = None if self._seeds[0] is None else self._seeds
-        if seeds is not None and not isinstance(self.vector_env.unwrapped, _WITH_RESET_MASK[1:]):
+        if seeds is not None and not isinstance(self.vector_env.unwrapped, _OF_ENVIRONMENTS):
             seeds = seeds[0]
         observation, info = self.vector_env.reset(seed=seeds, options=options or None)
         require_batched_infos(info, "SB3VecEnv")
@@ -186,16 +187,14 @@ class SB3VecEnv(VecEnv):
         Raises:
             AttributeError: If there is no such attribute, or it holds arrays, which may be about all environments.
         """
-        chosen, inner = self._get_indices(indices), self.vector_env.unwrapped
+        chosen, source = self._get_indices(indices), self.vector_env
         if attr_name in ("action_space", "observation_space"):
             return [getattr(self, attr_name) for _ in chosen]
-        if attr_name == "render_mode":
-            return [self.vector_env.render_mode for _ in chosen]
-        source = _wrapper_with(attr_name, self.vector_env)
-        if source is None and isinstance(inner, _WITH_RESET_MASK[1:]):
-            values = inner.get_attr(attr_name)
+        while source is not source.unwrapped and (hasattr(VectorWrapper, attr_name) or not _has_own(source, attr_name)):
+            source = source.env  # pyright: ignore[reportAttributeAccessIssue]
+        if isinstance(source, _OF_ENVIRONMENTS):
+            values = source.get_attr(attr_name)
             return [values[e] for e in chosen]
-        source = source or inner
         value = getattr(source, attr_name)
         if any(isinstance(each, np.ndarray) for each in (value if isinstance(value, tuple) else (value,))):
             raise AttributeError(f"{attr_name} is an array of {type(source).__name__}: read it from vector_env")
@@ -207,9 +206,7 @@ class SB3VecEnv(VecEnv):
         Raises:
             AttributeError: For any other vector environment, whose environments are not objects of their own.
         """
-        inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
-        if not isinstance(inner, _WITH_RESET_MASK[1:]):
-            raise AttributeError(f"the environments of {type(inner).__name__} have no attributes of their own to set")
+        inner, chosen = self._of_environments(), list(self._get_indices(indices))
         values = list(inner.get_attr(attr_name)) if len(chosen) < self.num_envs else [None] * self.num_envs
         for e in chosen:
             values[e] = value
@@ -218,46 +215,39 @@ class SB3VecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method of environments of gymnasium's sync vector environments, or of all of async ones.
+        """Calls a method of all environments of gymnasium's sync and async vector environments.
 
         Raises:
-            AttributeError: For any other vector environment.
-            ValueError: For some of the environments of an async one, which calls all.
+            AttributeError: For any other vector environment, whose environments are not objects of their own.
+            ValueError: For some of the environments.
         """
-        inner, chosen = self.vector_env.unwrapped, list(self._get_indices(indices))
-        if not isinstance(inner, _WITH_RESET_MASK[1:]):
-            homes = {"vector_env": self.vector_env, "vector_env.unwrapped": inner}
-            having = [home for home, each in homes.items() if hasattr(each, method_name)]
-            hint = f": call vec_env.{having[0]}.{method_name}" if having else ""
+        if sorted(self._get_indices(indices)) != list(range(self.num_envs)):
+            raise ValueError("gymnasium calls methods of all environments: leave out indices")
+        return list(self._of_environments().call(method_name, *method_args, **method_kwargs))
+
+    def _of_environments(self) -> Any:
+        """Returns gymnasium's vector environment of environments that are objects of their own."""
+        if not isinstance(inner := self.vector_env.unwrapped, _OF_ENVIRONMENTS):
             raise AttributeError(
-                f"the environments of {type(inner).__name__} have no methods of their own to call{hint}"
+                f"the environments of {type(inner).__name__} are no objects of their own: use vec_env.vector_env"
             )
-        if isinstance(inner, SyncVectorEnv):
-            return [inner.envs[e].get_wrapper_attr(method_name)(*method_args, **method_kwargs) for e in chosen]
-        if sorted(chosen) != list(range(self.num_envs)):
-            raise ValueError("AsyncVectorEnv calls methods of all its environments: use SyncVectorEnv, or no indices")
-        results = inner.call(method_name, *method_args, **method_kwargs)
-        return [results[e] for e in chosen]
+        return inner
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None
     ) -> list[bool]:
         """Returns whether a wrapper of that class is around; True for `Monitor`, whose infos this class provides.
 
-        Around the environments of gymnasium's sync and async vector environments, too; those in processes of their own
-        tell the names of their wrappers' classes.
+        Around the environments of gymnasium's sync vector environments, too; wrappers in other processes are not seen.
         """
         wrapped, layer = wrapper_class is Monitor, self.vector_env
-        while isinstance(layer, gym.vector.VectorWrapper):
+        while isinstance(layer, VectorWrapper):
             wrapped |= isinstance(layer, wrapper_class)
             layer = layer.env
-        chosen = list(self._get_indices(indices))
-        if wrapped or not isinstance(layer, _WITH_RESET_MASK[1:]):
-            return [wrapped for _ in chosen]
-        if isinstance(layer, gym.vector.SyncVectorEnv):
-            return [is_wrapped(layer.envs[e], wrapper_class) for e in chosen]
-        names, told = _names_of(wrapper_class), layer.call("__str__")  # "<Monitor<TimeLimit<..."
-        return [not names.isdisjoint(re.split(r"[^<\w]", str(told[e]))[0].split("<")) for e in chosen]
+        envs: Any = layer.envs if isinstance(layer, SyncVectorEnv) else [None] * self.num_envs
+        return [
+            wrapped or (envs[e] is not None and is_wrapped(envs[e], wrapper_class)) for e in self._get_indices(indices)
+        ]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Returns a frame per environment, None where the vector environment renders none."""
@@ -314,20 +304,9 @@ def _with_final(info: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
     return merged
 
 
-def _names_of(kind: type) -> set[str]:
-    """Returns the names of a class and of its subclasses."""
-    return {kind.__name__}.union(*map(_names_of, kind.__subclasses__()))
-
-
-def _wrapper_with(name: str, envs: VectorEnv) -> VectorEnv | None:
-    """Returns the outermost wrapper that has an attribute of its own, which vector environments do not have as such."""
-    if hasattr(VectorWrapper, name):
-        return None
-    while envs is not envs.unwrapped:
-        if name in vars(envs) or hasattr(type(envs), name):
-            return envs
-        envs = envs.env  # pyright: ignore[reportAttributeAccessIssue]
-    return None
+def _has_own(source: VectorEnv, name: str) -> bool:
+    """Returns whether a vector environment or wrapper has an attribute itself, not by what is inside."""
+    return name in vars(source) or hasattr(type(source), name)
 
 
 def _same(one: dict[str, Any], other: dict[str, Any]) -> bool:

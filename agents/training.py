@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization, require_kept
 from agents.algorithms import AppliedActionBuffer, build_model, normalized_env
-from agents.callbacks import OTHERS, DualAscentCallback, EvaluationCallback, RegularCallback, SafetyCallback
+from agents.callbacks import OTHERS, DualAscentCallback, RegularCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
@@ -77,7 +77,7 @@ def train(
         hyperparams: Keyword arguments of the algorithm in stable-baselines3, and `n_envs` and `normalize`, JSON values;
             what is not given has the values of `agents.hyperparams.DEFAULTS`. `n_timesteps` is for `ncs train`: here
             `steps` counts.
-        log_folder: Folder for TensorBoard's events, with evaluations on the way; None for neither.
+        log_folder: Folder for TensorBoard's events; None for none.
         on_progress: Called with the number of steps taken since its last call; `TrainingStopped` ends the training.
         callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
         start: An agent to go on from, of the same environment, algorithm and networks: its weights, the state of its
@@ -115,8 +115,6 @@ def train(
         beside.append(DualAscentCallback(loop.lagrangian, priced, episode_steps))
     callback = SafetyCallback(on_progress, history, priced)
     beside.append(callback)
-    if log_folder:
-        beside.append(EvaluationCallback(loop, seed))
     if start is not None:
         _go_on(start, loop, algorithm, model, env)
     current = partial(_agent, loop, algorithm, hyperparams, model, env, seed)
@@ -217,6 +215,5 @@ def _agent(
         seed=seed,
         shield_mode=loop.shield and loop.shield.mode,
         horizon=loop.shield and loop.shield.horizon,
-        is_filtered=loop.filter is not None,
         kwargs=loop.other_kwargs,
     )

@@ -39,9 +39,9 @@ from benchmarks.timing import timed
 from experiments.analysis.statistics import mean_interval
 from experiments.baselines import RegulatorWeights, controller
 from experiments.baselines.controllers import OBSERVER
+from experiments.commands.compare import CompareSettings
 from experiments.runs.arms import Arm
 from experiments.runs.loops import AS_TRAINED, under
-from experiments.settings import CompareSettings
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
 from shields import Certificate, certificate_for

@@ -22,12 +22,12 @@ from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import CONFIDENCE, hierarchical_interval
 from experiments.backends.execution import results_of
 from experiments.baselines import MARGINS
-from experiments.commands.compare import Comparison
+from experiments.commands.compare import CompareSettings, Comparison
 from experiments.commands.compare import compare as compared
 from experiments.runs.arms import by_arm, run_of_arm
 from experiments.runs.loops import AS_TRAINED, certificate_of, loop_config, registered_env
 from experiments.runs.provenance import versions
-from experiments.settings import Assignments, CompareSettings
+from experiments.settings import Assignments
 from experiments.terminal import text_table
 from ncs_gym import Channel, ChannelContract
 from ncs_gym.validation import counted

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, label, thousands
+from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, arm_styles, label, thousands
 from experiments.runs.loops import AS_TRAINED
 
 ATTACKED = "attacked"
@@ -39,12 +39,13 @@ def return_figure(summary: dict[str, Any]) -> CaptionedFigure:
     """Returns violating episodes under attack and the mean return as trained, two panels per environment."""
     environments = summary["environments"]
     names = list(dict.fromkeys(name for env in environments.values() for name in env["arms"] if _is_drawn(name)))
+    styles = arm_styles(names)
     figure, axes = _figure(len(environments), len(names), panels=2)
     with matplotlib.rc_context(STYLE):
         for (left, right), (title, env) in zip(axes, environments.items(), strict=True):
             for name in env["arms"].keys() & names:
                 scenarios, height = env["arms"][name]["scenarios"], len(names) - names.index(name)
-                style, own, attacked = ArmStyle.of(name), scenarios[AS_TRAINED], scenarios[ATTACKED]
+                style, own, attacked = styles[name], scenarios[AS_TRAINED], scenarios[ATTACKED]
                 _draw_interval(left, style, attacked["rate_ci95"], height, 100.0)
                 _draw_mean(left, style, 100.0 * attacked["rate"], height)
                 _draw_interval(right, style, own["return_ci95"], height)
@@ -68,11 +69,12 @@ def _by_run_figure(
     """Returns something of every trained run, a panel per environment."""
     environments = summary["environments"]
     names = list(dict.fromkeys(name for env in environments.values() for name in _trained(env)))
+    styles = arm_styles(names)
     figure, axes = _figure(len(environments), len(names))
     with matplotlib.rc_context(STYLE):
         for (axis,), (title, env) in zip(axes, environments.items(), strict=True):
             for name in _trained(env):
-                draw(axis, ArmStyle.of(name), env["arms"][name], len(names) - names.index(name))
+                draw(axis, styles[name], env["arms"][name], len(names) - names.index(name))
             label(axis, quantity, "", title)
         _name_rows(axes[0][0], names)
     return figure
@@ -120,7 +122,7 @@ def _draw_runs(axis: Axes, style: ArmStyle, values: list[float], height: int) ->
 
 
 def _draw_mean(axis: Axes, style: ArmStyle, value: float, height: int) -> None:
-    points = style.points | {"marker": "o", "ms": _MEAN_SIZE, "mfc": "white" if style.hollow else style.color}
+    points = style.points | {"marker": "o", "ms": _MEAN_SIZE, "mfc": style.color}
     axis.plot(value, height, ls="none", zorder=3, **points)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from collections.abc import Mapping
 
 _USAGE = """usage: ncs COMMAND [OPTIONS]
 
@@ -24,28 +23,31 @@ _REMEDIES = {
     errno.EISDIR: "a folder stands where a file is needed, name the file",
     errno.ENOENT: "check the path",
     errno.EACCES: "choose a path where you may read and write",
-    errno.EPERM: "choose a path where you may read and write",
-    errno.EROFS: "choose a path where you may write",
     errno.ENOSPC: "make room and start the command again, which keeps what is finished",
-    errno.EDQUOT: "make room and start the command again, which keeps what is finished",
 }
-_TRAINING = {"train": ("stable_baselines3", "torch", "tensorboard", "pandas", "pyarrow", "jinja2")}
-# The settings and the function of each command, and the packages that it needs of each extra.
-COMMANDS: dict[str, tuple[str, str, dict[str, tuple[str, ...]]]] = {
-    "compare": ("CompareSettings", "experiments.commands.compare:compare", _TRAINING),
-    "train": ("TrainSettings", "experiments.commands.train:train", _TRAINING),
-    "evaluate": ("EvaluateSettings", "experiments.commands.evaluate:evaluate", _TRAINING),
-    "sweep": ("SweepSettings", "experiments.commands.sweep:sweep", _TRAINING),
-    "render": ("RenderSettings", "experiments.commands.render:render", {"render": ("pygame",)}),
-    "synthesize": ("SynthesizeSettings", "experiments.commands.synthesize:synthesize", {}),
-    "verify": ("VerifySettings", "experiments.commands.verify:verify", {}),
-    "export-c": ("ExportCSettings", "experiments.commands.export_c:export_c_files", {}),
-    "bounds": ("BoundsSettings", "experiments.commands.bounds:bounds", {}),
-    "channel": ("ChannelSettings", "experiments.commands.channel:channel", {}),
-    "requirements": ("RequirementsSettings", "experiments.commands.requirements:requirements", {}),
-    "attack": ("AttackSettings", "experiments.commands.attack:attack", {}),
-    "audit": ("AuditSettings", "experiments.commands.audit:audit", {}),
-    "reproduce": ("ReproduceSettings", "experiments.commands.reproduce:reproduce", {}),
+# What each command does: the first sentence of its settings.
+COMMANDS = {
+    "compare": "Trains agents with and without the shield and compares violations, return and interventions.",
+    "train": "Trains one agent, evaluates it, and saves it with everything needed to use it.",
+    "evaluate": "Evaluates a trained agent, behind a shield or not, on any channel.",
+    "sweep": "Compares arms over a grid of channels: how safety, return and interventions depend on the channel.",
+    "render": "Draws an episode of a policy, as an animation or its last frame (docs/ncs_gym.md).",
+    "synthesize": "Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.",
+    "verify": "Verifies a certificate in exact rational arithmetic against the plant it was made for.",
+    "export-c": "Writes a safety filter in C99 for a board, with test vectors that check it (docs/deployment.md).",
+    "bounds": "Reads a record of a plant, and says what bounds of its disturbances the record proves.",
+    "channel": "Reads recorded packets, and says how often each channel contract would have been broken.",
+    "requirements": "Finds how old and how coarse the samples of a plant may be, so that it is certifiable.",
+    "attack": "Attacks shielded loops with worst-case disturbances and agents, and counts states outside.",
+    "audit": "Checks the claims of the paper (Liu et al.) one by one, from its own printed numbers.",
+    "reproduce": "Simulates Section 5 of Liu et al. with three designs: printed, certified, and OP's.",
+}
+# The extra that a command needs, and the packages of an extra.
+_EXTRAS = dict.fromkeys(("compare", "train", "evaluate", "sweep"), "train") | {"render": "render"}
+_PACKAGES = {
+    "train": ("stable_baselines3", "torch", "tensorboard", "pandas", "pyarrow", "jinja2"),
+    "render": ("pygame",),
+    "ray": ("ray",),
 }
 
 
@@ -69,12 +71,16 @@ def main() -> None:
         from ncs_gym.installation import GENERIC_NAMES, require_own_packages
 
         require_own_packages(*GENERIC_NAMES)
-        if sys.argv[1:] == ["--version"]:
+        command = "".join(sys.argv[1:2])
+        if command == "--version":
             print(f"ncs-gym {__version__}")
-            return
-        settings = parse(sys.argv[1:])
-        with nullcontext() if os.environ.get("NCS_DEBUG") else warnings_as_sentences():
-            _run(settings)
+        elif command in ("", "-h", "--help"):
+            print(_overview())
+            sys.exit(0 if command else _ERROR)
+        else:
+            with nullcontext() if os.environ.get("NCS_DEBUG") else warnings_as_sentences():
+                settings = parse(sys.argv[1:])
+                getattr(_module(command), command.replace("-", "_"))(settings)
     except KeyboardInterrupt as interrupt:
         sys.exit(_complain(str(interrupt) or "interrupted", _INTERRUPTED))
     except BrokenPipeError:
@@ -87,40 +93,51 @@ def main() -> None:
 
 
 def parse(arguments: list[str]) -> object:
-    """Returns the settings of the chosen command."""
-    from difflib import get_close_matches
-
+    """Returns the settings of the chosen command; raises ValueError if there is none of that name."""
     import tyro
 
-    from experiments import settings
     from ncs_gym.validation import shown
 
-    kinds = {name: getattr(settings, kind) for name, (kind, _, _) in COMMANDS.items()}
-    command, rest = "".join(arguments[:1]), arguments[1:]
-    if command in ("", "-h", "--help"):
-        print(_overview(kinds))
-        sys.exit(0 if command else _ERROR)
-    if command not in kinds:
-        near = get_close_matches(command, kinds, 1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(kinds)}"
-        raise ValueError(f"unknown command {shown(command)}; {hint}")
-    kind = kinds[command]
-    return tyro.cli(kind, prog=f"ncs {command}", args=rest, description=_description(kind))
+    command, *rest = arguments
+    if command not in COMMANDS:
+        raise ValueError(f"unknown command {shown(command)}; there are {', '.join(COMMANDS)}")
+    _require_extra(_EXTRAS.get(command, ""))
+    kind = settings_of(command)
+    settings = tyro.cli(kind, prog=f"ncs {command}", args=rest, description=_description(kind))
+    if getattr(settings, "engine", "local") == "ray":
+        _require_extra("ray")
+    return settings
 
 
-def _overview(kinds: Mapping[str, type]) -> str:
+def settings_of(command: str) -> type:
+    """Returns the class of a command's settings."""
+    return getattr(_module(command), f"{command.title().replace('-', '')}Settings")
+
+
+def _module(command: str) -> object:
+    from importlib import import_module
+
+    return import_module(f"experiments.commands.{command.replace('-', '_')}")
+
+
+def _require_extra(extra: str) -> None:
+    """Raises ModuleNotFoundError unless the packages of an extra are installed; it says what to install."""
+    from importlib.util import find_spec
+
+    from ncs_gym.installation import install_command
+
+    missing = [name for name in _PACKAGES.get(extra, ()) if find_spec(name) is None]
+    if missing:
+        raise ModuleNotFoundError(f"this command needs {', '.join(missing)}: {install_command(extra)}")
+
+
+def _overview() -> str:
     """Returns the commands, each with the first sentence about it, in lines of the terminal's width."""
     from experiments.terminal import wrapped
 
-    indent = max(map(len, kinds)) + 4
-    lines = [wrapped(_first_sentence(kind), label=f"  {name}", indent=indent) for name, kind in kinds.items()]
+    indent = max(map(len, COMMANDS)) + 4
+    lines = [wrapped(does, label=f"  {name}", indent=indent) for name, does in COMMANDS.items()]
     return "\n".join([_USAGE, *lines])
-
-
-def _first_sentence(settings: type) -> str:
-    from inspect import getdoc
-
-    return " ".join((getdoc(settings) or "").partition("\n\n")[0].split())
 
 
 def _description(settings: type) -> str:
@@ -133,20 +150,6 @@ def _description(settings: type) -> str:
     return "\n\n".join(wrapped(" ".join(paragraph.split())) for paragraph in text.split("\n\n"))
 
 
-def _run(settings: object) -> None:
-    from importlib import import_module
-
-    from experiments.commands import require_extra
-
-    _, target, extras = next(entry for entry in COMMANDS.values() if entry[0] == type(settings).__name__)
-    for extra, packages in extras.items():
-        require_extra(extra, *packages)
-    if getattr(settings, "engine", "local") == "ray":
-        require_extra("ray", "ray")
-    module, _, function = target.partition(":")
-    getattr(import_module(module), function)(settings)
-
-
 def _sentence(error: Exception) -> str:
     """Returns an error as one line; only unexpected errors show their type.
 
@@ -155,12 +158,13 @@ def _sentence(error: Exception) -> str:
     from ncs_gym.validation import printable
 
     ours = type(error).__module__.partition(".")[0] == "experiments"
-    expected = ours or isinstance(error, (ValueError, OSError, ImportError))
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
         text += f"; {_REMEDIES[error.errno]}" if error.errno in _REMEDIES else ""
+    elif ours or isinstance(error, (ValueError, OSError, ImportError)):
+        text = str(error)
     else:
-        text = str(error) if expected else f"{type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)"
+        text = f"{type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)"
     return printable(" ".join(text.split()))
 
 

@@ -20,52 +20,24 @@ _LEAST_WIDTH, GREATEST_WIDTH = 60, 80
 _TERMINAL_PERIOD, _FILE_PERIOD = 0.5, 20.0
 
 
-def text_table(
-    rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), left_columns: int = 1, keys: int = 1
-) -> str:
-    """Returns rows of cells as aligned text of at most 80 columns.
-
-    Columns that would make it wider stand closer together; those that still find no room stand in a table of their
-    own below, behind the key columns. Only key columns and one other that are wider together make a line longer.
+def text_table(rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), left_columns: int = 1) -> str:
+    """Returns rows of cells as aligned text; columns that would make it wider than 80 stand closer together.
 
     Args:
         rows: Rows of equal length, the header first; a row of a single cell is a title, which may be wider than its
             column, of the rows below it.
         rules: Indices of the rows above which a horizontal rule is drawn.
         left_columns: Number of columns that are aligned to the left; the others are aligned to the right.
-        keys: Number of the first columns that say what a row is about.
     """
     widths = [max(map(len, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
-    gap = 2 if _width(widths, 2) <= GREATEST_WIDTH else 1
-    parts = [list(range(keys))]
-    for column in range(keys, len(widths)):
-        has_room = _width([widths[each] for each in [*parts[-1], column]], gap) <= GREATEST_WIDTH
-        if has_room or len(parts[-1]) == keys:
-            parts[-1].append(column)
-        else:
-            parts.append([*range(keys), column])
-    return "\n\n".join(_table([_cells(row, part) for row in rows], rules, left_columns, gap) for part in parts)
-
-
-def _table(rows: Sequence[Sequence[str]], rules: Collection[int], left_columns: int, gap: int) -> str:
-    """Returns rows of cells as aligned text, however wide."""
-    widths = [max(map(len, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
-    rule = "-" * _width(widths, gap)
+    gap = 2 if sum(widths) + 2 * (len(widths) - 1) <= GREATEST_WIDTH else 1
+    rule = "-" * (sum(widths) + gap * (len(widths) - 1))
     lines = []
     for index, row in enumerate(rows):
         cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=len(row) > 1)]
         cells[:left_columns] = [cell.ljust(width) for cell, width in zip(row, widths[:left_columns], strict=False)]
         lines += [rule] * (index in rules) + [(" " * gap).join(cells).rstrip()]
     return "\n".join(lines)
-
-
-def _cells(row: Sequence[str], columns: Sequence[int]) -> Sequence[str]:
-    """Returns the cells of some columns; a title stays as it is."""
-    return row if len(row) == 1 else [row[column] for column in columns]
-
-
-def _width(widths: Sequence[int], gap: int) -> int:
-    return sum(widths) + gap * (len(widths) - 1)
 
 
 def terminal_width() -> int:

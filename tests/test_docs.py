@@ -116,10 +116,10 @@ def test_reference_has_every_public_name_of(package):
 
 
 def test_reference_of_the_command_line_has_the_settings_of_every_command():
-    from experiments.__main__ import COMMANDS
+    from experiments.__main__ import COMMANDS, settings_of
 
     listed = set(REFERENCE.findall((ROOT / "docs" / "api" / "experiments.md").read_text()))
-    assert {kind for kind, _, _ in COMMANDS.values()} <= {name.rpartition(".")[2] for name in listed}
+    assert {settings_of(command).__name__ for command in COMMANDS} <= {name.rpartition(".")[2] for name in listed}
 
 
 def test_table_of_errors_has_every_exception_class_and_no_other():

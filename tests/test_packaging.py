@@ -50,7 +50,6 @@ LAYERS = {
         {"hyperparams"},
         {"loop", "results", "sb3_vec_env"},
         {"algorithms", "callbacks", "evaluation", "agent_file"},
-        {"normalization"},
         {"agent"},
         {"training"},
     ),

@@ -30,9 +30,7 @@ UNPICKLING = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "shelve", "m
 NETWORK = {"socket", "ssl", "urllib", "urllib3", "http", "ftplib", "smtplib", "requests", "httpx", "aiohttp"}
 
 KNOWN = {
-    "experiments/settings/arguments.py": ["cloudpickle.dumps"],  # what is registered, for a digest: nobody reads it
-    # What the user says that he trusts (`ncs evaluate --trust`).
-    "agents/agent.py": ["algorithm_class(algorithm).load", "stable_baselines3.common.vec_env.VecNormalize.load"],
+    "experiments/runs/provenance.py": ["cloudpickle.dumps"],  # what is registered, for a digest: nobody reads it
 }
 
 

@@ -28,8 +28,8 @@ from benchmarks.study import (
 )
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
+from experiments.commands.compare import CompareSettings
 from experiments.runs.loops import changed_channel
-from experiments.settings import CompareSettings
 from ncs_gym.envs.env import ncs_env
 from tests.experiments.results import run, summary_of
 from tests.workers import no_worker_processes

@@ -35,21 +35,6 @@ def _here(jobs: int, counts: Any, log_folder: Path | None = None) -> Iterator[En
 
 @contextlib.contextmanager
 def no_worker_processes() -> Iterator[None]:
-    """Commands execute their training runs in this process.
-
-    Evaluations on the way take most of a short training and change no result (tests/agents/test_training.py): they are
-    left out.
-    """
-    from agents import training
-
-    with (
-        mock.patch("experiments.backends.execution.local_workers", _here),
-        mock.patch.object(training, "EvaluationCallback", _no_evaluation),
-    ):
+    """Commands execute their training runs in this process."""
+    with mock.patch("experiments.backends.execution.local_workers", _here):
         yield
-
-
-def _no_evaluation(*settings: Any) -> Any:
-    from agents.callbacks import RegularCallback
-
-    return RegularCallback(lambda: None)

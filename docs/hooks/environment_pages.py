@@ -8,8 +8,7 @@ from typing import Any
 
 from environment_page import environment_page
 
-from experiments.commands.render import render
-from experiments.settings import RenderSettings
+from experiments.commands.render import RenderSettings, render
 from ncs_gym.registration import needing_extras, registered_ids
 
 # Steps of the episode whose last picture a page shows.

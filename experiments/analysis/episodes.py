@@ -198,19 +198,3 @@ def paired_differences(episodes: pd.DataFrame, baseline: str) -> dict[str, Any]:
             "violating_episodes_by_run": violating.tolist(),
         }
     return differences
-
-
-def covered_fraction(summary: dict[str, Any]) -> float | None:
-    """Returns the fraction of the return from the zero input (0) to the unshielded agent (1) that the shielded one has.
-
-    It is None without these arms, where the zero input earns as much as the unshielded agent, which learned nothing
-    then, and where episodes end early: then returns are sums over different numbers of steps.
-    """
-    named = summary["references"] | summary["arms"]
-    if not {"shielded", "unshielded", "zero input"} <= named.keys():
-        return None
-    start, goal, here = (named[name] for name in ("zero input", "unshielded", "shielded"))
-    if len({arm["eval_steps"] for arm in (start, goal, here)}) > 1:
-        return None
-    start, goal, here = (arm["eval_return_mean"] for arm in (start, goal, here))
-    return (here - start) / (goal - start) if goal > start else None

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from ncs_gym.network.contract import MAX_AGE
-from ncs_gym.validation import counted
 
 # The record is cut into so many parts, into twice as many, and so on, to see how unevenly stalls are spread.
 _FEWEST_PARTS, _MOST_PARTS = 4, 4096
@@ -61,7 +60,7 @@ def broken_contracts(ages: np.ndarray, dt: float, also: Collection[int] = ()) ->
 
     Returns:
         Rows of JSON values, from the age that was kept, or the largest a contract can have, down to 0: all ages up to
-        10 and some larger ones. `halves` are the rates per hour of stalls that begin in either half of the record.
+        10 and some larger ones.
     """
     largest, steps = min(int(ages.max()), MAX_AGE), len(ages)
     decades = (10**power * each for power in (1, 2) for each in _OF_A_DECADE)
@@ -70,7 +69,6 @@ def broken_contracts(ages: np.ndarray, dt: float, also: Collection[int] = ()) ->
     rows = []
     for age in sorted((each for each in chosen if each <= largest or each in also), reverse=True):
         starts, lengths = stalls(ages, age)
-        first = int((starts < steps // 2).sum())
         rows.append(
             {
                 "max_age": age,
@@ -79,7 +77,6 @@ def broken_contracts(ages: np.ndarray, dt: float, also: Collection[int] = ()) ->
                 "per_hour_ci95": [bound / hours for bound in count_interval(starts, steps)],
                 "longest": int(lengths.max(initial=0)),
                 "broken": float(lengths.sum() / steps),
-                "halves": [2.0 * first / hours, 2.0 * (len(starts) - first) / hours],
             }
         )
     return rows
@@ -91,18 +88,7 @@ def how_often(row: dict[str, Any]) -> str:
     if row["times"] == 0:
         return f"at no time; a record of this length excludes more than {high} times per hour"
     times = "once" if row["times"] == 1 else f"{row['times']:,} times"
-    halves = " and ".join(map(rate_text, row["halves"]))
-    return f"{times}, {rate_text(row['per_hour'])} per hour [{low}, {high}] (by halves {halves})"
-
-
-def silences_text(oldest: int, row: dict[str, Any]) -> str:
-    """Returns how often the box may be left behind a shield, given the oldest age and its row."""
-    return (
-        "From any belief that the contract allows the box is kept until the newest sample is "
-        f"{counted(oldest, 'step')} old, "
-        f"in every mode that protects; the record exceeds that {how_often(row)}. Where the guarantee returns in "
-        "between and no late sample comes meanwhile, the box is left no more often."
-    )
+    return f"{times}, {rate_text(row['per_hour'])} per hour [{low}, {high}]"
 
 
 def rate_text(rate: float) -> str:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from typing import Any
 from tqdm import tqdm
 
 from experiments.errors import ClusterError, RunError, RunStopped
-from experiments.runs.run_store import file_name, load, save
+from experiments.runs.output_folder import file_name, load, save
 from experiments.settings import BackendSettings
 from experiments.terminal import progress_bar, say, warnings_sent
 
@@ -31,7 +30,7 @@ Engine = tuple[Callable[[int, Any], Future[tuple[Any, list[str]]]], type[Excepti
 
 
 def results_of(runs: Sequence[Any], folder: Path, settings: BackendSettings) -> list[Any]:
-    """Returns the results of all runs, in their order, without the agents' files; each is stored when it is finished.
+    """Returns the results of all runs, in their order; each is stored when it is finished.
 
     Args:
         runs: `TrainingRun`s of different names. Those whose results are in the folder are not executed again.
@@ -52,7 +51,7 @@ def results_of(runs: Sequence[Any], folder: Path, settings: BackendSettings) -> 
 
     def keep(run: Any, result: Any) -> None:
         save(folder, run, result)
-        results[run.name] = replace(result, files={}) if result.files else result  # they would fill the memory
+        results[run.name] = result
         if result.outcome:
             say(f"{run.name}: {result.outcome}")
 

@@ -6,22 +6,57 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
-from experiments.commands import short_version
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
-from experiments.settings import AttackSettings
-from experiments.settings.arguments import id_alone
+from experiments.settings import id_alone, require_horizon, require_limits, short_version
 from experiments.terminal import progress_bar, say, text_table, wrapped
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, LinearPlant
 from ncs_gym.registration import EPISODE_STEPS, registered_ids
 from ncs_gym.validation import counted
 from shields import Certificate, VectorSafetyShield, certificate_for
 from shields.atomic_write import write_atomically
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttackSettings:
+    """Attacks shielded loops with worst-case disturbances and agents, and counts states outside.
+
+    Outside are states beyond the safe set or the safe box. Every environment is attacked on its own channel and on
+    those that use its contract up. Disturbances push the next state farthest out, first errors and sensor noise have
+    full size, and agents are random or hostile. Ends with exit code 1 if a guaranteed state is outside.
+
+    Attributes:
+        env: Id of the only environment to attack; module:id first imports the module, which registers one of your own.
+            By default all registered ones.
+        steps: Simulated steps in all, at least 8 episodes of each environment and channel.
+        mode: Mode of the shield; "monitor" only watches. In mode lookahead states may leave the safe set.
+        safe_set: What the shields keep; by default the polytope, where there is one.
+        horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
+        out: File for the counts (JSON).
+        seed: Seed of the attack, >= 0.
+        smoke: Attack one environment a little, to see that everything works.
+    """
+
+    env: str | None = None
+    steps: int = 1_000_000
+    mode: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
+    safe_set: Literal["polytope", "ellipsoid"] | None = None
+    horizon: int | None = None
+    out: Path | None = None
+    seed: int = 0
+    smoke: bool = False
+
+    def __post_init__(self) -> None:
+        require_limits(self, steps=1, seed=0)
+        require_horizon(self, self.mode)
+
 
 # Episodes of a batch, at least and at most.
 _FEWEST, _MOST = 8, 1024

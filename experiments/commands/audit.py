@@ -6,14 +6,28 @@ import json
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
 from experiments.runs.output_folder import require_place
-from experiments.settings import AuditSettings
 from experiments.terminal import terminal_width, wrapped
 from shields.atomic_write import write_atomically
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditSettings:
+    """Checks the claims of the paper (Liu et al.) one by one, from its own printed numbers.
+
+    Attributes:
+        json: Print JSON instead of the table.
+        out: File for the rows (JSON).
+    """
+
+    json: bool = False
+    out: Path | None = None
+
 
 _INDENT = 16
 _RELATIONS = re.compile(r" (=|<=|>=|<|>) ")

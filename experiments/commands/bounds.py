@@ -3,19 +3,52 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import tyro
 
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
-from experiments.settings import BoundsSettings
+from experiments.settings import require_one_plant
 from ncs_gym import LinearPlant, Through, bounds_from_recording
 from ncs_gym.network.log_files import table_rows
 from ncs_gym.reading import LARGEST_LOG, read_file, require_packets
 from ncs_gym.recording import output_names
 from ncs_gym.validation import counted, shown
 from shields.atomic_write import write_atomically
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundsSettings:
+    """Reads a record of a plant, and says what bounds of its disturbances the record proves.
+
+    Attributes:
+        file: A table (CSV, or Parquet where pyarrow is installed) with the plant's inputs and outputs by name as
+            columns and a row per step: outputs as sampled, then the input that acted, which may be empty in the last
+            row. An output that is not a state is y1, y2, ... by its number. Further columns are not read.
+        env: Id of an environment with the plant, or module:id, which first imports the module.
+        plant: File of the plant (`LinearPlant.save`), in place of an environment's. Its disturbance says along which
+            directions to seek: E of Through(E, ...), else every state.
+        sensor: Half-widths of the noise of each output, as of a data sheet; by default the plant's own.
+        estimate_sensor: Seek them in the record, too.
+        out: File for the numbers (JSON).
+    """
+
+    file: tyro.conf.Positional[Path]
+    env: str | None = None
+    plant: Path | None = None
+    sensor: tuple[float, ...] = ()
+    estimate_sensor: bool = False
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        require_one_plant(self)
+        if self.env is None and self.plant is None:
+            raise ValueError("give the plant of the record: --plant FILE or --env ID")
+        if self.sensor and self.estimate_sensor:
+            raise ValueError("give either --sensor or --estimate-sensor, not both")
 
 
 def bounds(settings: BoundsSettings) -> None:

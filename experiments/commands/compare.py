@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
+import tyro
 
 from agents.agent_file import has_pretrained
-from agents.loop import LoopConfig
 from agents.results import Trajectory
 from experiments.analysis.episodes import (
     arm_summaries,
-    covered_fraction,
     episodes_table,
     paired_differences,
     parquet,
     training_table,
 )
-from experiments.analysis.statistics import gaussian_sentences, gaussian_summary
 from experiments.backends.execution import results_of
 from experiments.baselines import why_aimless
-from experiments.commands import short_version
 from experiments.plots.comparison_figures import comparison_figures, most_overridden
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import certificate_line, decimals_of, scenario_text, summary_text
@@ -31,15 +29,51 @@ from experiments.runs.loops import certificate_of, loop_config, registered_env
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.provenance import experiment_provenance
-from experiments.runs.training_run import RunResult, TrainingRun
-from experiments.settings import CompareSettings
-from experiments.settings.arguments import id_alone
+from experiments.runs.training_run import RunResult
+from experiments.settings import LearningSettings, id_alone, short_version
 from experiments.terminal import say, wrapped
-from ncs_gym import bound_violation_probability
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
-from shields import Certificate, SafetyFilter, verify
-from shields.runtime.starts import starts_known
+from shields import verify
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareSettings(LearningSettings):
+    """Trains agents with and without the shield and compares violations, return and interventions.
+
+    Synthesizes and exactly verifies a certificate, trains paired runs (equal seeds), evaluates each on the same
+    episodes, prints a table and leaves summary.json, settings.json, episodes.parquet, training.parquet, report.html,
+    figures, models, TensorBoard events and the certificate. Started again with the same folder, finished runs are kept.
+
+    Attributes:
+        out: Output folder.
+        seeds: Number of paired training runs per arm.
+        arms: unshielded, monitor (unshielded, counts what the shield would do), penalized (a penalty per violation),
+            penalized:WEIGHT, lagrangian (adapts it), shielded, shielded:MODE, lookahead, trusting (no error set), psf
+            (predictive filter), also with a margin in percent, psf:20, psf:tube; shield-at-test; also with +penalty.
+            Untrained: lqr, mpc, mpc:20, random, K-x_hat, zero-input, untrained, pretrained, alone or behind a filter,
+            lqr+shielded (docs/experiments.md).
+        baselines: Arms that are listed below the others and not drawn.
+        scenarios: Other evaluations: worst-case-disturbance, worse-channel, ideal-channel, attacked,
+            attacked-on-an-ideal-channel, gaussian (docs/experiments.md).
+        tuned_arms: Whether arms are trained with what was tuned for each by itself (`benchmarks.learning`); no option
+            of the command line.
+    """
+
+    out: Path = Path("runs/compare")
+    seeds: int = 3
+    arms: tuple[str, ...] = ("unshielded", "penalized", "trusting", "shielded")
+    baselines: tuple[str, ...] = (
+        "zero input",
+        "K x_hat",
+        "untrained",
+        "lqr",
+        "lqr+trusting",
+        "lqr+shielded",
+    )
+    scenarios: tuple[str, ...] = ("as trained",)
+    tuned_arms: tyro.conf.Suppress[bool] = False
+
 
 # Budget of `--smoke`: enough to pass through every part.
 _SMOKE = {"steps": 4_096, "episodes": 10, "seeds": 2}
@@ -65,8 +99,7 @@ class Comparison(NamedTuple):
 def compare(settings: CompareSettings) -> Comparison:
     """Runs `ncs compare`: prints the table, writes the files, and returns what they are made of."""
     settings = _with_full_names(shortened(settings))
-    noise = "gaussian" if settings.noise == "gaussian" else None
-    loop = loop_config(settings.env, settings.channel, noise=noise, between_samples=settings.between_samples)
+    loop = loop_config(settings.env, settings.channel, between_samples=settings.between_samples)
     names = settings.arms + settings.baselines
     require_arms(settings, loop, names)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
@@ -77,21 +110,33 @@ def compare(settings: CompareSettings) -> Comparison:
     if is_any_trained(settings, names):
         print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed
-    runs = _training_runs(settings, loop, certificate)
+
+    runs = [run_of_arm(settings, loop, certificate, name, index) for index in range(settings.seeds) for name in names]
+    runs.sort(key=lambda run: run.trains)  # first those that are evaluated only: they take a second
     results = results_of(runs, settings.out, settings)
+
     common = {"environment": id_alone(settings.env), "algorithm": settings.algo}
-    episodes = episodes_table(results, **common)
-    summary = _summary(settings, loop, certificate, runs, results, episodes)
+    episodes, arms = episodes_table(results, **common), arm_summaries(results, settings.mode)
+    baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
+    compared = episodes[episodes["arm"].isin(settings.arms)]
+    summary = {
+        "arms": {name: arms[name] for name in settings.arms},
+        "references": {name: arms[name] for name in settings.baselines},
+        "paired_differences": {"baseline": baseline, "arms": paired_differences(compared, baseline)},
+    } | experiment_provenance(settings, loop, certificate, runs)
     findings = findings_of(summary)
-    if "gaussian_noise" in summary:
-        findings += gaussian_sentences(summary["gaussian_noise"])
-    by_name = {(run.arm, run.index): run for run in runs}
+    if settings.smoke:
+        findings.append("A smoke run shows that everything runs; the agents that it trains have hardly learned.")
+        if PRETRAINED in settings.arms:
+            findings[-1] += " What a shield does, the rows of the pretrained agent show."
+
+    by_name = {(run.arm, run.index): (run, result) for run, result in zip(runs, results, strict=True)}
 
     def path_of(arm: str, index: int, scenario: str, episode: int) -> Trajectory:
-        return by_name[arm, index].trajectory(settings.out / "models", scenario, episode)
+        run, result = by_name[arm, index]
+        return run.trajectory(result.files, scenario, episode)
 
-    shown = most_overridden(episodes, settings.arms, path_of)
-    figures = comparison_figures(plant, summary, by_arm(results), shown)
+    figures = comparison_figures(plant, summary, by_arm(results), most_overridden(episodes, settings.arms, path_of))
     certificate.save(settings.out / "certificate.json")
     files = {
         "episodes.parquet": parquet(episodes, summary),
@@ -99,12 +144,15 @@ def compare(settings: CompareSettings) -> Comparison:
         "report.html": comparison_report(summary, verification, figures, findings),
     }
     write_results(settings.out, summary, files, figures)
-    count = counted(settings.seeds, "run")
+
     trained = max(arm["train_steps"] for arm in summary["arms"].values())
     per_run = f"{trained:,} training steps per arm, {counted(settings.episodes, 'episode')} per run"
-    print(f"\n{wrapped(f'{settings.env}: {count} and {per_run}')}\n")
-    short = [_smoke_text(settings)] if settings.smoke else []
-    print(_tables(summary), *map(wrapped, [*findings, *short]), f"files: {settings.out}", sep="\n")
+    runs_per_arm = counted(settings.seeds, "run")
+    print(f"\n{wrapped(f'{settings.env}: {runs_per_arm} and {per_run}')}\n")
+    print(summary_text(summary["arms"], summary["references"]))
+    for scenario in next(iter(summary["arms"].values()))["conditions"]:
+        print("\n" + scenario_text(scenario, summary["arms"], summary["references"]))
+    print(*map(wrapped, findings), f"files: {settings.out}", sep="\n")
     return Comparison(episodes, summary, results)
 
 
@@ -137,66 +185,6 @@ def _with_full_names(settings: CompareSettings) -> CompareSettings:
     return replace(settings, arms=arms, baselines=baselines)
 
 
-def _smoke_text(settings: CompareSettings) -> str:
-    """Returns what a short version shows."""
-    text = "A smoke run shows that everything runs; the agents that it trains have hardly learned."
-    if PRETRAINED in settings.arms:
-        text += " What a shield does, the rows of the pretrained agent show."
-    return text
-
-
-def _tables(summary: dict[str, Any]) -> str:
-    arms, baselines = summary["arms"], summary["references"]
-    scenarios = next(iter(arms.values()))["conditions"]
-    others = [scenario_text(scenario, arms, baselines) for scenario in scenarios]
-    return "\n\n".join([summary_text(arms, baselines), *others])
-
-
-def _training_runs(settings: CompareSettings, loop: LoopConfig, certificate: Certificate) -> list[TrainingRun]:
-    """Returns the runs of every arm and of the baselines, first those that are evaluated only: they take a second."""
-    names = settings.arms + settings.baselines
-    runs = [run_of_arm(settings, loop, certificate, name, index) for index in range(settings.seeds) for name in names]
-    return sorted(runs, key=lambda run: run.trains)
-
-
-def _summary(
-    settings: CompareSettings,
-    loop: LoopConfig,
-    certificate: Certificate,
-    runs: Sequence[TrainingRun],
-    results: Sequence[RunResult],
-    episodes: pd.DataFrame,
-) -> dict[str, Any]:
-    arms = arm_summaries(results, settings.mode)
-    gaussian = {}
-    if settings.noise == "gaussian":
-        gaussian["gaussian_noise"] = gaussian_noise_of(loop, certificate, arms)
-    baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
-    compared = episodes[episodes["arm"].isin(settings.arms)]
-    return {
-        "arms": {name: arms[name] for name in settings.arms},
-        "references": {name: arms[name] for name in settings.baselines},
-        "paired_differences": {"baseline": baseline, "arms": paired_differences(compared, baseline)},
-    } | (gaussian | experiment_provenance(settings, loop, certificate, runs))
-
-
-def gaussian_noise_of(loop: LoopConfig, certificate: Certificate, arms: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """Returns the bound on the probability that an episode leaves the safe set, and how often shielded arms did.
-
-    The bound is about episodes that begin in the safe set, and behind a downlink stay there until the first decision
-    takes effect; where not all do, it is 1. Mode "lookahead" may leave that
-    set on purpose and is not listed.
-    """
-    env = ncs_env(loop.single())
-    steps = loop.episode_steps or 1
-    downlink = env.downlink_protocol
-    known = starts_known(SafetyFilter(certificate, env.plant), env.initial_set, downlink.input_delay)
-    begins_inside = downlink.contract is not None and all(each.in_safe_set for each in known)
-    bound = bound_violation_probability(env.plant, env.channel, steps) if begins_inside else 1.0
-    claimed = {name: arm for name, arm in arms.items() if arm["shielded"] and arm["mode"] != "lookahead"}
-    return gaussian_summary(bound, steps, claimed)
-
-
 def findings_of(summary: dict[str, Any]) -> list[str]:
     """Returns what a comparison shows, in sentences."""
     findings = [
@@ -213,10 +201,9 @@ def findings_of(summary: dict[str, Any]) -> list[str]:
             findings.append(f"{name}: all that was proposed was safe, so that this arm shows nothing of the shield.")
             continue
         leaves = ", which may be left in this mode; the box may not" if arm["mode"] == "lookahead" else ""
-        proof = "no broken assumption was seen" if "gaussian_noise" in summary else "the proof held"
         findings.append(
-            f"{name}: {proof} in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation episodes; the "
-            f"true state came to {arm['times_safe_set']:.3f} times the safe set{leaves}."
+            f"{name}: the proof held in {arm['guaranteed_episodes']:,} of {arm['eval_episodes']:,} evaluation "
+            f"episodes; the true state came to {arm['times_safe_set']:.3f} times the safe set{leaves}."
         )
     paired = summary["paired_differences"]
     for name, difference in paired["arms"].items():
@@ -224,11 +211,6 @@ def findings_of(summary: dict[str, Any]) -> list[str]:
         decimals = decimals_of(mean, *(interval or ()))
         text = f" [{interval[0]:+z.{decimals}f}, {interval[1]:+z.{decimals}f}]" if interval else ""
         findings.append(f"{name}, paired with {paired['baseline']}: return {mean:+z.{decimals}f}{text}.")
-    acted = any(arm["shielded"] and arm["train_intervention_rate"] for arm in summary["arms"].values())
-    if acted and (covered := covered_fraction(summary)) is not None:
-        findings.append(
-            f"The shielded return covers {100 * covered:.0f} % of the way from the zero input to the unshielded agent."
-        )
     if "monitor" in summary["arms"]:
         findings.append("In brackets: what the shield would have overridden.")
     return findings

@@ -2,18 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from experiments.runs.loops import registered_env
-from experiments.settings import ExportCSettings
 from experiments.terminal import wrapped
 from ncs_gym import LinearPlant
 from ncs_gym.validation import counted
-from shields import Certificate, CertificateError
-from shields.export import export_c
+from shields import Certificate, CertificateError, export
 
 
-def export_c_files(settings: ExportCSettings) -> None:
+@dataclass(frozen=True, kw_only=True)
+class ExportCSettings:
+    """Writes a safety filter in C99 for a board, with test vectors that check it (docs/deployment.md).
+
+    Attributes:
+        file: File of the certificate (JSON): with a polytope, under a channel contract.
+        plant: File of the plant that `LinearPlant.save` wrote, or id of an environment with a plant of its own.
+        out: Output folder.
+        single: Write the rows of the safe set as float, which needs less memory and is faster on a board that computes
+            in single precision; the estimate stays double.
+    """
+
+    file: tyro.conf.Positional[Path]
+    plant: str
+    out: Path = Path("filter")
+    single: Annotated[bool, tyro.conf.arg(name="float")] = False
+
+
+def export_c(settings: ExportCSettings) -> None:
     """Runs `ncs export-c`."""
     certificate = Certificate.load(settings.file)
     if Path(settings.plant).is_file():
@@ -24,7 +44,7 @@ def export_c_files(settings: ExportCSettings) -> None:
         if env.downlink_protocol.input_delay or env.channel.on_request:
             does = "takes samples on request" if env.channel.on_request else "commits inputs ahead"
             raise CertificateError(f"the filter is not exported, since {settings.plant} {does}: give the plant's file")
-    table = export_c(certificate, plant, settings.out, single=settings.single)
+    table = export.export_c(certificate, plant, settings.out, single=settings.single)
     age = counted(table.sizes["H"], "step")
     print(wrapped(f"The filter takes {table.cost}."))
     print(

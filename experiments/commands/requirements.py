@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
+from pathlib import Path
 
 import shields
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
-from experiments.settings import RequirementsSettings
+from experiments.settings import require_one_plant
 from experiments.terminal import text_table, wrapped
 from ncs_gym import LinearPlant
 from ncs_gym.network.channel import in_time
@@ -15,6 +17,34 @@ from ncs_gym.validation import counted
 from shields.atomic_write import write_atomically
 from shields.packaged_certificates import synthesis_status
 from shields.synthesis.network_requirements import AGES, share_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequirementsSettings:
+    """Finds how old and how coarse the samples of a plant may be, so that it is certifiable.
+
+    Prints what share of the safe box a certificate keeps, - where none was found (which does not prove that there is
+    none).
+
+    Attributes:
+        env: Id of an environment with a plant of its own, or module:id, which first imports the module. By default
+            ncs_gym/CartPole-v0.
+        plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
+        ages: Largest ages of the newest sample when an input takes effect [steps]; by default up to 32, and the
+            environment's.
+        resolutions: Quantization steps, in the units of the measurements, 0 for none; by default the environment's.
+        out: File for the table with its certificates (JSON).
+    """
+
+    env: str | None = None
+    plant: Path | None = None
+    ages: tuple[int, ...] = ()
+    resolutions: tuple[float, ...] = ()
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        require_one_plant(self)
+
 
 _DEFAULT_ENV = "ncs_gym/CartPole-v0"
 _TITLES = {

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from shutil import rmtree
 
 from experiments.analysis.episodes import arm_summary
 from experiments.backends.execution import results_of
-from experiments.commands import short_version
 from experiments.report.text_tables import summary_text
-from experiments.runs.arms import Arm, require_arms, require_used, run_of_arm
+from experiments.runs.arms import Arm, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import experiment_provenance
-from experiments.runs.training_run import CHECKPOINT, RunResult, history_of
-from experiments.settings import TrainSettings
+from experiments.runs.training_run import CHECKPOINT, history_of
+from experiments.settings import LearningSettings, short_version
 from experiments.terminal import wrapped
 from ncs_gym.validation import counted
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings(LearningSettings):
+    """Trains one agent, evaluates it, and saves it with everything needed to use it.
+
+    Started again with the same folder, an interrupted training goes on from its last checkpoint; --force begins anew.
+
+    Attributes:
+        out: Output folder.
+        arm: Arm that the agent is trained in; see the arms of `ncs compare`.
+    """
+
+    out: Path = Path("runs/train")
+    arm: str = "shielded"
+
 
 # Budget of `--smoke`.
 _SMOKE = {"steps": 4_096, "episodes": 10}
@@ -25,7 +41,7 @@ _SMOKE = {"steps": 4_096, "episodes": 10}
 def train(settings: TrainSettings) -> None:
     """Runs `ncs train`."""
     settings = short_version(settings, **_SMOKE)
-    require_used(settings, [settings.arm])
+    arm = Arm.of(settings.arm, settings.mode)
     loop = loop_config(settings.env, settings.channel, between_samples=settings.between_samples)
     require_arms(settings, loop, [settings.arm])
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
@@ -40,27 +56,20 @@ def train(settings: TrainSettings) -> None:
     if history and history[-1].steps < run.steps:
         run = replace(run, went_on_after=history[-1].steps)
         print(f"the training in {settings.out} goes on after {counted(run.went_on_after, 'step')}", flush=True)
-    results = results_of([run], settings.out, settings)
+    (result,) = results_of([run], settings.out, settings)
     rmtree(checkpoint, ignore_errors=True)
-    mode = Arm.of(settings.arm, settings.mode).mode
-    arms = {settings.arm: arm_summary(results, mode, fixed_policy=True)}
+    arms = {settings.arm: arm_summary([result], arm.mode, fixed_policy=True)}
     certificate.save(settings.out / "certificate.json")
-    summary = {"arms": arms, "went_on_after": results[0].went_on_after}
-    summary |= experiment_provenance(settings, loop, certificate, [run])
-    write_results(settings.out, summary)
-    print(f"{counted(results[0].train_steps, 'training step')}, {counted(settings.episodes, 'episode')}\n")
-    print(summary_text(arms, {}), *_hints(results[0], is_smoke=settings.smoke), sep="\n")
-    print(f"agent: {settings.out / 'models' / run.name}")
-
-
-def _hints(result: RunResult, *, is_smoke: bool) -> list[str]:
-    """Returns what to do after a training in which a shield had nothing to do; nothing after another one."""
-    if not result.train_steps or result.train_violation_steps or result.train_interventions:
-        return []
-    longer = "leave out --smoke" if is_smoke else "raise --steps"
-    return [
-        wrapped(
-            "This training had no violation and no override, so it does not show what the shield is for: "
-            f"{longer}, or run `ncs compare`, which trains with and without the shield."
+    summary = {"arms": arms, "went_on_after": result.went_on_after}
+    write_results(settings.out, summary | experiment_provenance(settings, loop, certificate, [run]))
+    print(f"{counted(result.train_steps, 'training step')}, {counted(settings.episodes, 'episode')}\n")
+    print(summary_text(arms, {}))
+    if result.train_steps and not result.train_violation_steps and not result.train_interventions:
+        longer = "leave out --smoke" if settings.smoke else "raise --steps"
+        print(
+            wrapped(
+                "This training had no violation and no override, so it does not show what the shield is for: "
+                f"{longer}, or run `ncs compare`, which trains with and without the shield."
+            )
         )
-    ]
+    print(f"agent: {settings.out / 'models' / run.name}")

@@ -3,17 +3,41 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
 
 import shields
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
-from experiments.settings import VerifySettings
+from experiments.settings import require_one_plant
 from ncs_gym import LinearPlant
 from ncs_gym.registration import registered_ids
 from shields import Certificate, CertificateError
 from shields.atomic_write import write_atomically
 from shields.held import held_text
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifySettings:
+    """Verifies a certificate in exact rational arithmetic against the plant it was made for.
+
+    Attributes:
+        file: File of the certificate (JSON).
+        env: Id of an environment with a plant of its own, or module:id; without it, the one whose plant has the
+            certificate's fingerprint.
+        plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
+        out: File for the verdicts (JSON).
+    """
+
+    file: tyro.conf.Positional[Path]
+    env: str | None = None
+    plant: Path | None = None
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        require_one_plant(self)
 
 
 def verify(settings: VerifySettings) -> None:

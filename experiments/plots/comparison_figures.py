@@ -21,7 +21,6 @@ from experiments.plots.figure_style import (
     ArmStyle,
     CaptionedFigure,
     arm_styles,
-    draw_estimate,
     input_labels,
     label,
     legend_below,
@@ -68,11 +67,12 @@ def comparison_figures(
 def scatter_figure(summary: dict[str, dict[str, Any]], styles: Mapping[str, ArmStyle]) -> CaptionedFigure:
     """Returns mean return against violating episodes of every arm, a panel per scenario, from the arms' summaries."""
     caption = (
-        f"Cost and return in evaluation, better to the upper left. {_vertical_bars(summary)}"
-        " horizontal bars Clopper and Pearson's 95 % interval of violating episodes given the trained"
-        " agents; long ones leave the figure, tables have all ends."
-        " Markers differ in size only to show where they coincide. Violations are those of the true state,"
-        " returns the environment's own, without penalties. Episodes that end early sum fewer steps."
+        "Cost and return in evaluation, better to the upper left. Markers are means over the runs of an arm, small dots"
+        " runs. Vertical bars are Student's 95 % interval of the mean return over runs (of policies without training,"
+        " over episodes; of one run there is no interval), horizontal bars Clopper and Pearson's 95 % interval of"
+        " violating episodes given the trained agents; long ones leave the figure, tables have all ends. Markers differ"
+        " in size only to show where they coincide. Violations are those of the true state, returns the environment's"
+        " own, without penalties. Episodes that end early sum fewer steps."
     )
     scenarios = [AS_TRAINED, *next(iter(summary.values()))["conditions"]]
     with matplotlib.rc_context(STYLE):
@@ -107,22 +107,21 @@ def _draw_evaluated(axis: Axes, style: ArmStyle, arm: dict[str, Any]) -> None:
         rates = [100.0 * rate for rate in arm["eval_violation_rate_by_run"]]
         dots = {"ms": 4.5, "mfc": style.color, "mec": "white", "mew": 0.6, "zorder": 2.5}
         axis.plot(rates, arm["eval_return_by_run"], ls="none", marker="o", **dots)
-    rate, mean = arm["eval_violation_rate"], arm["eval_return_mean"]
-    draw_estimate(axis, style, rate, arm["eval_violation_rate_ci95"], mean, arm["eval_return_ci95"])
+    rate, mean, means = 100.0 * arm["eval_violation_rate"], arm["eval_return_mean"], arm["eval_return_ci95"]
+    bars = {"color": style.color, "lw": 1.3, "ms": 9.0, "mew": 1.3}
+    if means is not None:
+        axis.plot([rate] * 2, means, "-_", **bars)
+    axis.plot([100.0 * end for end in arm["eval_violation_rate_ci95"]], [mean] * 2, "-|", **bars)
+    axis.plot(rate, mean, ls="none", **style.points, zorder=3)
 
 
-def _vertical_bars(summary: dict[str, dict[str, Any]]) -> str:
-    """Returns what markers and their vertical bars are, given the summaries of arms, as the beginning of a sentence."""
-    runs = max(arm["runs"] for arm in summary.values())
-    over = {arm["eval_return_ci95_over"] for arm in summary.values()}
-    text = f"Small dots are runs, markers the mean of {runs} of them; " if runs > 1 else "A marker is one run; "
-    if over == {"episodes"}:
-        return text + "vertical bars are Student's 95 % interval of the mean return over episodes,"
-    if runs == 1:
-        fixed = " that of a policy without training Student's 95 % interval over episodes;" if len(over) > 1 else ""
-        return f"{text}the return of an agent has no interval,{fixed}"
-    fixed = " (of policies without training, over episodes)" if len(over) > 1 else ""
-    return f"{text}vertical bars are Student's 95 % interval of the mean return over runs{fixed},"
+_TRAINING_CAPTION = (
+    "Training. Lines are means over the runs of an arm, bands reach from the lowest to the highest run. Returns are"
+    " those of recent finished episodes, with the penalties of arms that get some. Interventions are rates over the"
+    f" last {RATE_WINDOW:,} steps (over all, before there are as many); a monitor's are what the shield would have"
+    " overridden, its agent is the unshielded one. Episodes begin together: where those of all environments take more"
+    " steps, rates rise and fall with them."
+)
 
 
 def training_figure(arms: ResultsByArm, styles: Mapping[str, ArmStyle]) -> CaptionedFigure:
@@ -133,7 +132,7 @@ def training_figure(arms: ResultsByArm, styles: Mapping[str, ArmStyle]) -> Capti
     watching = [name for name in arms if Arm.of(name).mode is not None]
     few = False
     with matplotlib.rc_context(STYLE):
-        figure = CaptionedFigure((11.0, 3.9), _training_caption(arms, bool(watching)))
+        figure = CaptionedFigure((11.0, 3.9), _TRAINING_CAPTION)
         axes = figure.subplots(1, 3 if watching else 2)
         for name, results in arms.items():
             steps, returns, violations, interventions = _histories(results)
@@ -163,29 +162,6 @@ def training_figure(arms: ResultsByArm, styles: Mapping[str, ArmStyle]) -> Capti
             handles["lowest to highest run"] = Patch(color="#555555", alpha=0.2, lw=0.0)
         legend_below(figure, handles)
         return figure
-
-
-def _training_caption(arms: ResultsByArm, is_watched: bool) -> str:
-    runs = max(len(results) for results in arms.values())
-    band = f"Lines are means over {runs} runs per arm, bands reach from the lowest to the highest run."
-    text = f"Training. {band if runs > 1 else 'One run per arm, so there is no band.'}"
-    if is_watched:
-        text += (
-            f" Interventions are rates over the last {RATE_WINDOW:,} steps (over all, before there are as many). "
-            "Episodes begin together: where those of all environments take more steps, rates rise and fall with them."
-        )
-    unfinished = [name for name, results in arms.items() if not np.isfinite(_histories(results)[1]).any()]
-    if 0 < len(unfinished) < len(arms):
-        text += (
-            f" No episode of {' and '.join(unfinished)} was finished, so that it has no return; those of others are of "
-            "episodes that ended early."
-        )
-    if "monitor" in arms:
-        text += " The monitor's are what the shield would have overridden; its agent is the unshielded one."
-    penalized = [name for name in arms if Arm.of(name).penalizes_interventions or Arm.of(name).penalizes_violations]
-    if penalized:
-        text += f" The return in training contains the penalties that {' and '.join(penalized)} get."
-    return text
 
 
 def _histories(results: Sequence[RunResult]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

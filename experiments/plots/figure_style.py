@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import matplotlib
@@ -15,7 +16,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments.runs.arms import Arm
 from ncs_gym import LinearPlant
 
 # Keys of matplotlib's settings are a type of their own, which plain text is not.
@@ -99,36 +99,22 @@ def _width(names: list[str], columns: int) -> float:
     return sum(_LETTER * max(map(len, part)) + _HANDLE for part in np.array_split(np.array(names), columns))
 
 
-# Color (Okabe and Ito's palette, which color-blind readers can distinguish) and marker (for print without color).
-ARM_COLORS_AND_MARKERS = {
-    "unshielded": ("#D55E00", "o"),
-    "shielded": ("#0072B2", "^"),
-    "shielded:switch": ("#009E73", "P"),
-    "shielded:boundary": ("#CC79A7", "X"),
-    "shielded:lookahead": ("#000080", "p"),
-    "penalized": ("#E69F00", "s"),
-    "shielded:project": ("#56B4E9", "v"),
-    "trusting": ("#7F0000", "<"),
-    "psf": ("#117733", ">"),
-    "lagrangian": ("#DDCC77", "d"),
-    "monitor": ("#4D4D4D", "D"),
-    "controller": ("#BBBBBB", "*"),
+# Colors (after Okabe and Ito, which color-blind readers can distinguish) and markers (for print without color).
+_LOOKS = {
+    "#E69F00": "s",
+    "#7F0000": "<",
+    "#009E73": "P",
+    "#CC79A7": "X",
+    "#56B4E9": "v",
+    "#117733": ">",
+    "#DDCC77": "d",
+    "#4D4D4D": "D",
+    "#000080": "p",
+    "#BBBBBB": "*",
 }
-# Markers of policies that are not trained, in the color of what they are behind.
-_CONTROLLER_MARKERS = {
-    "lqr": "H",
-    "mpc": "x",
-    "random": "8",
-    "K x_hat": "1",
-    "zero input": "2",
-    "untrained": "3",
-    "pretrained": "*",
-}
-# Filters that share the color of another one.
-_HOLLOW = ("psf:tube",)
-_SOLID, _DOTTED, _DASHED = "-", (0, (1.0, 1.3)), (0, (4.5, 1.6))
-# Dashes, and size of the marker [points], of an arm with a price of its own per violating step.
-_PRICED, _PRICED_SIZE = (0, (12.0, 1.6)), 13.0
+# Those of the arms that most figures have.
+_OWN = {"unshielded": ("#D55E00", "o"), "shielded": ("#0072B2", "^")}
+_DASHES: tuple[Any, ...] = ("-", (0, (4.5, 1.6)), (0, (1.0, 1.3)))
 
 
 @dataclass(frozen=True)
@@ -137,40 +123,15 @@ class ArmStyle:
 
     Attributes:
         color: Hexadecimal color.
-        dashes: Line style of matplotlib.
         marker: Marker of matplotlib.
-        hollow: Whether markers are outlines.
+        dashes: Line style of matplotlib.
         size: Size of the markers [points].
     """
 
     color: str
-    dashes: Any
     marker: str
-    hollow: bool
-    size: float
-
-    @classmethod
-    def of(cls, name: str) -> ArmStyle:
-        """Returns an arm's own style: the color stands for the shield, dashed lines and hollow markers for a penalty.
-
-        Dotted lines and hollow markers stand for what acts in evaluation alone; so they do for the monitor, whose agent
-        is the unshielded one and whose curves lie on that arm's. A price of one's own has long dashes and
-        a large marker.
-
-        Raises:
-            ValueError: If the arm is unknown.
-        """
-        arm = Arm.of(name)
-        color, marker = ARM_COLORS_AND_MARKERS[_look_of(arm)]
-        if name == "monitor" or not arm.filters_training:
-            return cls(color, _DOTTED, marker if arm.filters_training else "h", hollow=True, size=11.0)
-        if not arm.is_trained:
-            hollow = str(arm.mode).startswith(_HOLLOW)
-            return cls(color, _DASHED, _CONTROLLER_MARKERS[arm.policy.partition(":")[0]], hollow, size=9.0)
-        if arm.violation_weight is not None:
-            return cls(color, _PRICED, marker, hollow=True, size=_PRICED_SIZE)
-        changed = arm.penalizes_interventions or str(arm.mode).startswith(_HOLLOW)
-        return cls(color, _DASHED if changed else _SOLID, marker, hollow=changed, size=10.0 if changed else 7.0)
+    dashes: Any = "-"
+    size: float = 8.0
 
     @property
     def line(self) -> dict[str, Any]:
@@ -180,13 +141,8 @@ class ArmStyle:
     @property
     def points(self) -> dict[str, Any]:
         """Keyword arguments of matplotlib for markers; their fill is transparent."""
-        return {
-            "marker": self.marker,
-            "ms": self.size,
-            "mfc": "none" if self.hollow else to_rgba(self.color, 0.45),
-            "mec": self.color,
-            "mew": 1.3,
-        }
+        own = {"marker": self.marker, "ms": self.size, "mec": self.color, "mew": 1.3}
+        return own | {"mfc": to_rgba(self.color, 0.45)}
 
     def handle(self, *, line: bool = True, points: bool = False) -> Line2D:
         """Returns the arm's entry in a legend."""
@@ -194,36 +150,7 @@ class ArmStyle:
         return Line2D([], [], **shape, **(self.points if points else {}))
 
 
-def _look_of(arm: Arm) -> str:
-    if not arm.is_trained and arm.mode is None:
-        return "controller"
-    if arm.penalizes_violations:
-        return "lagrangian" if arm.adapts_penalty else "penalized"
-    if arm.mode is None:
-        return "unshielded"
-    if not arm.is_shielded:
-        return arm.mode.partition(":")[0]
-    named = f"shielded:{arm.mode}"
-    return named if named in arm.name or arm.mode == "lookahead" else "shielded"
-
-
 def arm_styles(names: Iterable[str]) -> dict[str, ArmStyle]:
-    """Returns the styles of arms that are drawn together: where two would share a color, the later gets a free one."""
-    styles = {name: ArmStyle.of(name) for name in names}
-    wanted, seen = {style.color for style in styles.values()}, set()
-    free = iter([color for color, _ in ARM_COLORS_AND_MARKERS.values() if color not in wanted])
-    for name, style in styles.items():
-        styles[name] = replace(style, color=next(free, style.color)) if style.color in seen else style
-        seen.add(style.color)
-    return styles
-
-
-def draw_estimate(
-    axis: Axes, style: ArmStyle, rate: float, rates: list[float] | None, mean: float, means: list[float] | None
-) -> None:
-    """Draws a mean return against a rate [%], and their intervals where there are any."""
-    if means is not None:
-        axis.plot([100.0 * rate] * 2, means, "-_", color=style.color, lw=1.3, ms=9.0, mew=1.3)
-    if rates is not None:
-        axis.plot([100.0 * end for end in rates], [mean] * 2, "-|", color=style.color, lw=1.3, ms=9.0, mew=1.3)
-    axis.plot(100.0 * rate, mean, ls="none", **style.points, zorder=3)
+    """Returns the styles of arms that are drawn together, which all differ for up to thirty arms."""
+    looks = itertools.cycle(ArmStyle(*look, dashes) for dashes in _DASHES for look in _LOOKS.items())
+    return {name: ArmStyle(*_OWN[name]) if name in _OWN else next(looks) for name in names}

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from math import floor, log10
 from typing import Any
 
-from experiments.runs.loops import losses_text
 from experiments.terminal import text_table, wrapped
 from ncs_gym.validation import counted
 from shields import Certificate, Report
@@ -15,26 +14,6 @@ from shields.certificate_text import size_of
 _MOST_DECIMALS = 4
 # Arms and points whose proof did not hold that are listed.
 _MOST_LOST = 6
-# Two lines of the header of what a point of a sweep fixes, by its key.
-_SIDES = {
-    "loss": ("", "loss"),
-    "downlink_loss": ("commands", "lost"),
-    "delay": ("", "delay"),
-    "quantization_step": ("quanti-", "zation"),
-    "burst_length": ("", "burst"),
-    "mass_factor": ("", "mass"),
-}
-# Those that not every environment has.
-_OF_SOME = ("downlink_loss", "mass_factor")
-_OUTCOMES = (
-    ("", "arm"),
-    ("violating", "episodes"),
-    ("violating", "training"),
-    ("over-", "ridden"),
-    ("", "return"),
-)
-
-
 _Arms = dict[str, dict[str, Any]]
 
 
@@ -118,57 +97,32 @@ def decimals_of(*numbers: float) -> int:
 
 
 def sweep_table(cells: list[dict[str, Any]]) -> str:
-    """Returns a row per point of the grid and arm, below a line that says what all points have in common."""
-    swept = [side for side in _SIDES if len({cell[side] for cell in cells}) > 1]
-    fixed = [side for side in _SIDES if side not in swept and (side not in _OF_SOME or cells[0][side] is not None)]
-    common = [f"{_name(side)} {_side_text(side, cells[0][side])}" for side in fixed]
-    if steps := max(arm["train_steps"] for cell in cells for arm in cell["arms"].values()):
-        common.append(f"{steps:,} training steps per arm")
-    rows = [list(line) for line in zip(*(_SIDES[side] for side in swept), *_OUTCOMES, strict=True)]
-    for cell in cells:
-        point = [_side_text(side, cell[side]) for side in swept]
-        rows += [[*point, name, *_outcome(arm)] for name, arm in cell["arms"].items()]
-    table = text_table(rows, rules=(2,), left_columns=0, keys=len(swept) + 1)
-    above = [f"in all rows: {', '.join(common)}"] if common else []
-    below = [text for text in (proofs_text(cells), losses_text(cells)) if text]
-    return "\n\n".join([*map(wrapped, above), table, *map(wrapped, below)])
-
-
-def proofs_text(cells: Sequence[dict[str, Any]]) -> str:
-    """Returns where the proof of a shield did not hold in all evaluation episodes, in a sentence; nothing if it did."""
-    swept = [side for side in _SIDES if len({cell.get(side) for cell in cells}) > 1]
+    """Returns a row per point of the grid and arm, and below it where proofs did not hold."""
+    rows = [["", "", "", "violating", "violating", "over-", ""]]
+    rows += [["loss", "delay", "arm", "episodes", "training", "ridden", "return"]]
     lost = []
     for cell in cells:
-        point = ", ".join(f"{_name(side)} {_side_text(side, cell[side])}" for side in swept)
         for name, arm in cell["arms"].items():
+            rows.append(
+                [
+                    f"{cell['loss']:g}",
+                    f"{cell['delay']}",
+                    name,
+                    f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
+                    f"{arm['train_violation_steps']:,}" if arm["train_steps"] else "-",
+                    "-" if arm["mode"] is None else f"{100 * arm['intervention_rate']:.1f} %",
+                    f"{arm['eval_return_mean']:z.1f}",
+                ]
+            )
             held, played = arm["guaranteed_episodes"], arm["eval_episodes"]
             if arm["shielded"] and held < played:
-                lost.append(f"{name}{' at ' + point if point else ''} ({held:,} of {played:,})")
+                lost.append(f"{name} at loss {cell['loss']:g}, delay {cell['delay']} ({held:,} of {played:,})")
+    table = text_table(rows, rules=(2,), left_columns=0)
     if not lost:
-        return ""
+        return table
     more = f" and {counted(len(lost) - _MOST_LOST, 'other')}" if len(lost) > _MOST_LOST else ""
-    return f"The proof held in some evaluation episodes only: {'; '.join(lost[:_MOST_LOST])}{more}."
-
-
-def _name(side: str) -> str:
-    first, second = _SIDES[side]
-    return f"{first.removesuffix('-')}{'' if first.endswith('-') else ' '}{second}".strip()
-
-
-def _side_text(side: str, value: float | None) -> str:
-    """Returns what a point fixes as text; without a value it is the environment's own."""
-    if value is None:
-        return "own"
-    return "none" if side == "burst_length" and not value else f"{value:g}"
-
-
-def _outcome(arm: dict[str, Any]) -> list[str]:
-    return [
-        f"{arm['eval_violating_episodes']:,} of {arm['eval_episodes']:,}",
-        f"{arm['train_violation_steps']:,}" if arm["train_steps"] else "-",
-        "-" if arm["mode"] is None else f"{100 * arm['intervention_rate']:.1f} %",
-        f"{arm['eval_return_mean']:z.1f}",
-    ]
+    text = f"The proof held in some evaluation episodes only: {'; '.join(lost[:_MOST_LOST])}{more}."
+    return f"{table}\n\n{wrapped(text)}"
 
 
 def certificate_line(certificate: Certificate, verification: Report) -> str:

@@ -122,22 +122,6 @@ def full_names(names: Sequence[str], mode: str) -> tuple[str, ...]:
     return tuple(Arm.of(name, mode).name for name in names)
 
 
-def require_used(settings: LearningSettings, names: Sequence[str]) -> None:
-    """Raises unless one of the arms of these names has each penalty that is asked for.
-
-    Raises:
-        ValueError: If none has.
-    """
-    arms, defaults = [Arm.of(name, settings.mode) for name in names], type(settings)
-    used = {
-        "intervention_penalty": ("with +penalty", any(arm.penalizes_interventions for arm in arms)),
-        "violation_penalty": ("penalized", any(arm.penalizes_violations and not arm.adapts_penalty for arm in arms)),
-    }
-    for name, (kind, is_used) in used.items():
-        if not is_used and (value := getattr(settings, name)) != getattr(defaults, name):
-            raise ValueError(f"--{name.replace('_', '-')} {value:g} is for an arm {kind}, which is not asked for")
-
-
 def is_shield(mode: str | None) -> bool:
     """Returns whether a mode is one of the shield's that protects: not "monitor", and no other filter."""
     return mode in _SHIELD_MODES

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import os
 import sys
@@ -15,7 +14,7 @@ from typing import Any
 import gymnasium as gym
 
 from agents.loop import LoopConfig
-from experiments.settings.arguments import id_alone
+from experiments.settings import id_alone
 from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network import contract_of
@@ -78,12 +77,6 @@ def import_module(module: str) -> None:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # something that the module itself imports is missing
         raise ValueError(f"there is no module {module!r}, neither installed nor in {folder}") from error
-
-
-def module_digest(module: str) -> str:
-    """Returns the SHA-256 of an imported module's source, empty for no module: what it registers may change."""
-    file = getattr(sys.modules.get(module), "__file__", None)
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
 
 
 def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs: Any) -> LoopConfig:
@@ -149,19 +142,6 @@ def fewer_losses(channel: Channel) -> str:
         f"{channel.mean_loss:.3g} of the packets are lost in the long run, not {wanted:.3g}: the channel loses at most "
         f"{most} in a row"
     )
-
-
-def losses_text(cells: Sequence[dict[str, Any]]) -> str:
-    """Returns where channels lose fewer packets than a point of the grid says, in a sentence; nothing if none does."""
-    fewer = {}
-    for cell in cells:
-        if cell["mean_loss"] < cell["loss"] - SHARE:
-            bursts = f" in bursts of {cell['burst_length']:g}" if cell["burst_length"] else ""
-            fewer[f"{cell['loss']:g}{bursts}"] = f"{cell['mean_loss']:.3f}"
-    if not fewer:
-        return ""
-    listed = ", ".join(f"{truth} for {asked}" for asked, truth in fewer.items())
-    return f"Channels lose only so many packets in a row, so that fewer are lost than asked for: {listed}."
 
 
 def _bursts(loss: float, length: float, send_period: int) -> GilbertElliott:

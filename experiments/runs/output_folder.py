@@ -1,24 +1,28 @@
-"""The output folder of a command: results of other settings in it are not replaced."""
+"""The output folder of a command: results of other settings in it are not replaced, finished runs not done again."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
+import re
 from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from experiments.errors import OtherResultsError
 from experiments.settings import lasting_settings
+from experiments.terminal import say
 from shields.atomic_write import write_atomically
 
 # Files by which a folder is known to hold results.
 _RESULTS = ("summary.json", "runs/*.json", "tensorboard/*/checkpoint/history.json")
 # Settings that may change in the same folder: results of runs that are there become part of others.
-_FREE = {"seeds", "arms", "baselines", "losses", "delays", "quantization_steps", "burst_lengths", "mass_factors"}
-_FREE |= {"downlink_losses"}
+_FREE = {"seeds", "arms", "baselines", "losses", "delays"}
 # Differences that a message lists.
 _MOST_LISTED = 3
 
@@ -101,3 +105,41 @@ def require_place(path: Path | None) -> None:
 def _system_error(number: int, path: Path) -> OSError:
     """Returns what the operating system would raise: a subclass of OSError that belongs to the number."""
     return OSError(number, os.strerror(number), str(path))
+
+
+def file_name(run: Any) -> str:
+    """Returns the name of a run's file: its name, with hyphens for what is special in file names."""
+    return re.sub(r"[^\w.+-]+", "-", run.name) + ".json"
+
+
+def save(folder: Path, run: Any, result: Any) -> None:
+    """Writes the result of a run into `runs/NAME.json`, and before it the agent's files into `models/NAME/`.
+
+    Raises:
+        OSError: If a file cannot be written.
+    """
+    path, models = folder / "runs" / file_name(run), folder / "models" / run.name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)  # an older result must not stand for the newer agent
+    for name, content in result.files.items():
+        models.mkdir(parents=True, exist_ok=True)
+        write_atomically(models / name, content)
+    values = {name: value for name, value in asdict(result).items() if name != "files"}
+    text = json.dumps({"key": run.key, "result": values}, default=np.ndarray.tolist)
+    write_atomically(path, text + "\n")
+
+
+def load(folder: Path, run: Any) -> Any | None:
+    """Returns the result of a run; None if there is none of its settings and versions, or not whole."""
+    path = folder / "runs" / file_name(run)
+    if not path.exists() or not all((folder / "models" / run.name / name).is_file() for name in run.leaves):
+        return None
+    try:
+        document = json.loads(path.read_bytes())
+        if document["key"] != run.key:
+            return None
+        files = {name: (folder / "models" / run.name / name).read_bytes() for name in run.leaves}
+        return replace(run.result_type.of_json(document["result"]), files=files)
+    except (OSError, LookupError, TypeError, ValueError, RecursionError):
+        say(f"{path} is damaged: its run is done again")
+        return None

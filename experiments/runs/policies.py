@@ -24,8 +24,6 @@ _SHORT = {"zero": "zero input"}
 PRETRAINED = "pretrained"
 # Agents that a message names.
 _MOST_LISTED = 4
-# Folder of a sweep's certificates, one for each channel.
-CERTIFICATES = "certificates"
 
 # Maps an observation, shape (entries,), and its info to an action, shape (m,).
 Policy = Callable[[np.ndarray, dict], np.ndarray]
@@ -73,7 +71,7 @@ def agent_named(name: str, env_id: str | None) -> tuple[Agent, Path]:
         AgentError: If there is no agent, or it is of another environment.
         ValueError: If the folder of a run holds several agents, or nothing says of which environment the agent is.
     """
-    from agents.agent import Agent  # imports torch
+    from agents import Agent  # imports torch, or says what to install
 
     path = _only_agent(Path(name))
     if name != PRETRAINED and not path.exists():
@@ -102,16 +100,7 @@ def _only_agent(folder: Path) -> Path:
 
 
 def certificate_file(agent: Path) -> Path | None:
-    """Returns the certificate beside an agent, or of the run that left it in its models; None if there is none.
-
-    A sweep has one for each channel, whose name the names of its agents begin with.
-    """
+    """Returns the certificate beside an agent, or of the run that left it in its models; None if there is none."""
     agent = agent.resolve()
-    found = [agent / "certificate.json"]
-    if agent.parent.name == "models":
-        run = agent.parent.parent
-        of_channel = [each for each in (run / CERTIFICATES).glob("*.json") if agent.name.startswith(f"{each.stem}-")]
-        # Of a former sweep with fewer sides to its grid another one may be there, with a shorter name.
-        found += sorted(of_channel, key=lambda each: -len(each.stem))
-        found += [run / "certificate.json"]
-    return next((file for file in found if file.is_file()), None)
+    places = (agent, agent.parent.parent) if agent.parent.name == "models" else (agent,)
+    return next((file for place in places if (file := place / "certificate.json").is_file()), None)

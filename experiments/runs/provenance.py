@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
@@ -11,9 +12,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
+from cloudpickle import dumps
+
 from agents.loop import LoopConfig
-from experiments.settings import LearningSettings, lasting_settings
+from experiments.settings import LearningSettings, id_alone, lasting_settings
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.reading import read_file
 from shields import Certificate
 
 if TYPE_CHECKING:
@@ -48,6 +53,26 @@ def _source_digest() -> str:
     for path in files:
         digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
+
+
+def module_digest(module: str) -> str:
+    """Returns the SHA-256 of an imported module's source, empty for no module: what it registers may change."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
+
+
+def registration_of(env_id: str) -> str:
+    """Returns the SHA-256 of what an id is registered with, empty for none: a module may register it otherwise later.
+
+    Functions and classes of a module count by their names: its source is another matter (`module_digest`).
+    """
+    spec = gym.registry.get(id_alone(env_id))
+    if spec is None:
+        return ""
+    kwargs = dict(spec.kwargs)
+    if isinstance(plant := kwargs.get("plant"), str):  # a file, which may be another one later
+        kwargs["plant"] = read_file(Path(plant))
+    return hashlib.sha256(dumps([sorted(kwargs.items()), spec.max_episode_steps])).hexdigest()
 
 
 def experiment_provenance(

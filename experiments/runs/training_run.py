@@ -5,25 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from math import nan
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.agent_file import AGENT_FILES, write_files
+from agents.agent_file import AGENT_FILES
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import HISTORY_FILE, Episode, Evaluation, TrainingPoint, Trajectory
 from experiments.baselines import controller, tuned_weights
-from experiments.runs.loops import AS_TRAINED, import_module, module_digest, under
-from experiments.runs.provenance import versions
+from experiments.runs.loops import AS_TRAINED, import_module, under
+from experiments.runs.provenance import module_digest, registration_of, versions
 from experiments.settings import LearningSettings
-from experiments.settings.arguments import registration_of
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
 from shields import Certificate
@@ -201,13 +199,12 @@ class TrainingRun:
             import_module(self.module)
         trained = None
         if self.trains:
-            from agents.training import (
-                train,
-            )  # imports torch, which the process that only collects results does without
+            from agents.agent import Agent  # imports torch, which the process that only collects results does without
+            from agents.training import train
 
             logs, start, history = log_folder and log_folder / self.name, None, []
             if logs is not None and self.went_on_after:
-                start, history = _loaded(logs / CHECKPOINT), history_of(logs / CHECKPOINT)
+                start, history = Agent.load(logs / CHECKPOINT), history_of(logs / CHECKPOINT)
             elif logs is not None:
                 shutil.rmtree(logs, ignore_errors=True)
             trained = train(
@@ -237,9 +234,9 @@ class TrainingRun:
             went_on_after=self.went_on_after,
         )
 
-    def trajectory(self, models: Path, scenario: str, episode: int) -> Trajectory:
-        """Returns an episode of the evaluation of this run, played again with its agent from the folder of all."""
-        agent = _loaded(models / self.name) if self.trains else _agent_of(self)
+    def trajectory(self, files: Mapping[str, bytes], scenario: str, episode: int) -> Trajectory:
+        """Returns an episode of the evaluation of this run, played again with the agent of its result's files."""
+        agent = _agent_of(replace(self, agent_files=dict(files)) if self.trains else self)
         return self._evaluated(agent, scenario, None, episode).trajectory
 
     def _evaluated(
@@ -265,20 +262,14 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
 def _agent_of(run: TrainingRun) -> Agent | None:
     """Returns the agent that a run does not train: that of its files, or one with initial weights; None for none."""
     if run.agent_files:
-        with TemporaryDirectory() as folder:
-            write_files(Path(folder), run.agent_files)
-            return _loaded(Path(folder))
+        from agents.agent import Agent  # imports torch
+
+        return Agent.of_files(run.agent_files)
     if run.policy_kind != "untrained":
         return None
     from agents.training import untrained
 
     return untrained(run.loop, run.training_seed, run.algorithm, run.settings)
-
-
-def _loaded(folder: Path) -> Agent:
-    from agents.agent import Agent  # imports torch
-
-    return Agent.load(folder)
 
 
 def history_of(checkpoint: Path) -> list[TrainingPoint]:

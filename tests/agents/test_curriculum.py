@@ -33,7 +33,7 @@ def test_channel_of_a_shield_is_not_set_through_stable_baselines3_or_the_adapter
     shielded = DummyVecEnv([shield])
     with pytest.raises(AttributeError):
         shielded.set_attr("channel", Channel(loss=0.5))
-    with pytest.raises(AttributeError, match="have no attributes of their own"):
+    with pytest.raises(AttributeError, match="are no objects of their own"):
         SB3VecEnv(shields()).set_attr("channel", Channel())
 
 
@@ -92,7 +92,7 @@ def test_what_is_drawn_from_changes_for_episodes_that_begin_by_themselves_and_in
     assert seen == [0.1] * 4 + [0.5] * 9
     with pytest.raises(ValueError, match="takes the place of what was given: give channel"):
         draws.draw_from(downlink=[Channel()])
-    with pytest.raises(AttributeError, match=r"call vec_env\.vector_env\.draw_from"):
+    with pytest.raises(AttributeError, match=r"use vec_env\.vector_env"):
         env.env_method("draw_from", [Channel()])
 
 

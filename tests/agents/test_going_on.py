@@ -3,7 +3,6 @@
 import copy
 import json
 from dataclasses import replace
-from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -24,7 +23,7 @@ from agents import (
 from agents.results import HISTORY_FILE, history_document
 from ncs_gym import truck_trailer
 from tests.certificates import certificate_of
-from tests.product import safety_shield, vector_shield
+from tests.product import safety_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 SMALL = {"n_envs": 8, "n_steps": 16, "batch_size": 128, "n_epochs": 2}
@@ -164,11 +163,3 @@ def test_replay_buffers_refuse_actions_that_a_wrapper_outside_changes():
     turned = gym.wrappers.TransformAction(shield(), lambda action: -0.5 * action, None)
     with pytest.raises(ValueError, match="a wrapper outside the shield changes actions"):
         learn(turned)
-    with pytest.raises(ValueError, match="takes several steps of the environment"):
-        learn(gym.wrappers.RepeatAction(shield(), 2))
-
-
-def test_agent_trained_behind_a_filter_says_so_in_its_files(loop, tmp_path):
-    filtered = LoopConfig(env=CRUISE, filter=partial(vector_shield, certificate=loop.shield.certificate))
-    train(filtered, 128, 0, hyperparams=SMALL).agent.save(tmp_path)
-    assert Agent.load(tmp_path).is_filtered

@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents import SafetyCallback, SB3VecEnv, evaluate
+from agents import SafetyCallback, SB3VecEnv
 from agents.loop import LoopConfig, ShieldSettings
 from agents.training import require_trainable, train, untrained
 from tests.certificates import certificate_of
@@ -128,7 +128,7 @@ def test_missing_package_is_one_sentence(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "settings"), [("PPO", TINY), ("SAC", TINY_REPLAY)])
-def test_rates_and_evaluations_reach_tensorboard_and_change_nothing(algorithm, settings, tmp_path):
+def test_rates_reach_tensorboard_and_logs_change_nothing(algorithm, settings, tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     steps = 1024
@@ -139,20 +139,9 @@ def test_rates_and_evaluations_reach_tensorboard_and_change_nothing(algorithm, s
     assert {"safety/violation_rate", "safety/intervention_rate", "safety/violation_steps", "time/fps"} <= set(tags)
     assert max(event.value for event in events.Scalars("safety/mean_correction")) > 0.0
     assert {event.value for event in events.Scalars("safety/guaranteed_rate")} == {1.0}
-    assert {event.value for event in events.Scalars("eval/success_rate")} == {1.0}
-    evaluated = [event.step for event in events.Scalars("eval/mean_reward")]
-    assert evaluated[0] == 0
-    assert evaluated[-1] == result.steps
-    assert len(evaluated) >= 4
     if algorithm == "PPO":
         rates = [event.value for event in events.Scalars("safety/intervention_rate")]
         assert sum(rates) * 256 == pytest.approx(result.interventions, abs=1)
-    # The evaluation of the end is that of the returned agent.
-    episodes = evaluate(shielded(), lambda seen, _: result.agent.act(seen), 20, 5).episodes
-    mean = np.mean([episode.episode_return for episode in episodes])
-    assert events.Scalars("eval/mean_reward")[-1].value == pytest.approx(mean, rel=1e-5)
-    rate = sum(episode.interventions for episode in episodes) / sum(episode.steps for episode in episodes)
-    assert events.Scalars("eval/intervention_rate")[-1].value == pytest.approx(rate, rel=1e-5)
     plain = train(shielded(), steps, 5, algorithm, settings)
     assert plain.agent.checksum == result.agent.checksum
     np.testing.assert_array_equal([astuple(one) for one in plain.history], [astuple(one) for one in result.history])

@@ -195,65 +195,44 @@ def test_one_agent_is_trained(tmp_path, without_workers):
 @pytest.mark.slow
 def test_sweep_leaves_its_files_and_goes_on_where_it_was(tmp_path, without_workers):
     out = tmp_path / "sweep"
-    grid = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--episodes", "3", "--steps", "256"]
-    grid += ["--arms", "shielded", "lqr", "--seeds", "1"]
+    grid = ["--losses", "0.5", "0.6", "--delays", "1", "--channel", "burst_length=3", "--episodes", "3"]
+    grid += ["--steps", "256", "--arms", "shielded", "lqr", "--seeds", "1"]
     given = ("--hyperparams", "n_envs=4", "n_steps=64", "--out", out)
     succeeded("sweep", *grid, *given)
     summary = json.loads((out / "summary.json").read_text())
-    assert [(cell["loss"], cell["burst_length"]) for cell in summary["cells"]] == [(0.5, 0), (0.5, 3)]
+    assert [(cell["loss"], cell["delay"]) for cell in summary["cells"]] == [(0.5, 1), (0.6, 1)]
     assert all(cell["arms"]["shielded"]["eval_violation_steps"] == 0 for cell in summary["cells"])
     rows = pq.read_table(out / "episodes.parquet").to_pylist()
     assert len(rows) == 4 * 3
-    assert {"loss", "delay", "burst_length", "arm", "run", "violating"} <= set(rows[0])
-    assert {(row["quantization_step"], row["burst_length"]) for row in rows} == {(None, 0.0), (None, 3.0)}
+    assert {"arm", "run", "violating"} <= set(rows[0])
+    assert {(row["loss"], row["delay"]) for row in rows} == {(0.5, 1), (0.6, 1)}
     assert {row["arm"] for row in pq.read_table(out / "training.parquet").to_pylist()} == {"shielded"}
+    evaluated = succeeded("evaluate", out / "models" / "loss0.6-delay1-shielded-0", "--episodes", 3)
+    assert "The guarantee held after 600 of 600 steps." in evaluated.prose
     assert [path.name for path in (out / "figures").iterdir()] == ["violations.png"]
     assert not (out / "report.html").exists()
     before = digests(out)
     other = ncs("sweep", *grid, *given, "--seed", "1")
     assert_one_sentence(other, "of other settings (seed 0, now 1)", "--force")
     assert digests(out) == before
-    shutil.rmtree(out / "models" / "loss0.5-delay1-burst3.0-shielded-0")
-    (out / "runs" / "loss0.5-delay1-burst3.0-lqr-0.json").unlink()
-    (out / "runs" / "loss0.5-delay1-burst3.0-shielded-0.json").unlink()
+    shutil.rmtree(out / "models" / "loss0.6-delay1-shielded-0")
+    (out / "runs" / "loss0.6-delay1-lqr-0.json").unlink()
+    (out / "runs" / "loss0.6-delay1-shielded-0.json").unlink()
     with without_pictures():
         again = succeeded("sweep", *grid, *given)
     assert "2 of 4 runs were finished before" in again.stderr
     assert json.loads((out / "summary.json").read_text()) == summary
 
 
-@pytest.mark.slow
-def test_agents_of_a_sweep_are_evaluated_behind_the_certificate_of_their_own_channel(tmp_path, without_workers):
-    grid = ["--env", "ncs_gym/CartPoleTwoWay-v0", "--losses", 0.2, "--delays", 1, "--downlink-losses", 0, 0.3]
-    out = tmp_path / "sweep"
-    succeeded("sweep", *grid, "--episodes", 3, "--steps", 256, "--arms", "shielded", "--seeds", 1, "--out", out)
-    ages = []
-    for cell in json.loads((out / "summary.json").read_text())["cells"]:
-        agent = out / "models" / f"loss0.2-delay1-burst0.0-down{cell['downlink_loss']}-shielded-0"
-        ages.append(Certificate.load(certificate_file(agent)).contract.max_age)
-        assert cell["arms"]["shielded"]["eval_proved_steps"] == 600
-        assert "The guarantee held after 600 of 600 steps." in succeeded("evaluate", agent, "--episodes", 3).prose
-    assert ages == [6, 8]
-    assert Certificate.load(out / "certificate.json").contract.max_age == 6
-
-
-def test_certificate_of_an_agent_is_that_beside_it_then_that_of_its_channel_then_that_of_its_run(tmp_path):
+def test_certificate_of_an_agent_is_that_beside_it_then_that_of_its_run(tmp_path):
     agent, single = tmp_path / "models" / "loss0.2-delay1-shielded-0", tmp_path / "agent"
-    for folder in (agent, single, tmp_path / "certificates"):
+    for folder in (agent, single):
         folder.mkdir(parents=True)
     assert certificate_file(agent) is certificate_file(single) is None
-    last = tmp_path / "certificate.json"
-    for file in (
-        last,
-        tmp_path / "certificates" / "loss0.2-delay1.json",
-        agent / "certificate.json",
-    ):
-        (tmp_path / "certificates" / "loss0.2-delay10.json").touch()
-        if file != last:  # of a former sweep with one side to its grid
-            (tmp_path / "certificates" / "loss0.2.json").touch()
+    for file in (tmp_path / "certificate.json", agent / "certificate.json"):
         file.touch()
         assert certificate_file(agent) == file
-        assert certificate_file(tmp_path / "models" / "loss0.5-delay1-shielded-0") == last
+        assert certificate_file(tmp_path / "models" / "other-0") == tmp_path / "certificate.json"
     assert certificate_file(single) is None
 
 

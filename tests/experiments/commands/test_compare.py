@@ -8,12 +8,11 @@ from agents import tuned_hyperparams
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
 from agents.results import Episode
-from experiments.analysis.episodes import arm_summary, covered_fraction, episodes_table, paired_differences
-from experiments.commands.compare import shortened
+from experiments.analysis.episodes import arm_summary, episodes_table, paired_differences
+from experiments.commands.compare import CompareSettings, shortened
 from experiments.report.text_tables import summary_text
 from experiments.runs.arms import run_of_arm
 from experiments.runs.training_run import RunResult
-from experiments.settings import CompareSettings
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
 
@@ -144,26 +143,6 @@ def test_summary_of_an_arm_adds_up():
     assert summary["intervention_rate"] == 0.5
     assert summary["eval_return_by_run"] == [2.0, 6.0]
     assert summary["eval_return_ci95"][1] - 4.0 == pytest.approx(12.706 * 2.0, rel=1e-3)  # t with one degree of freedom
-
-
-def covered(shielded, shielded_steps=200, unshielded=-5.0):
-    means = {"unshielded": (unshielded, 200), "shielded": (shielded, shielded_steps), "zero input": (-65.0, 200)}
-    named = {name: {"eval_return_mean": mean, "eval_steps": steps} for name, (mean, steps) in means.items()}
-    return covered_fraction({"arms": named, "references": named})
-
-
-def test_covered_fraction_is_zero_at_the_zero_input_and_one_at_the_unshielded_agent():
-    assert [covered(value) for value in (-65.0, -5.0, -20.0)] == [0.0, 1.0, 0.75]
-
-
-@pytest.mark.parametrize("unshielded", [-65.0, -189.6])
-def test_an_agent_that_earns_no_more_than_the_zero_input_leaves_nothing_to_cover(unshielded):
-    assert covered(-60.0, unshielded=unshielded) is None
-
-
-def test_returns_of_episodes_that_end_early_are_no_covered_fraction():
-    assert covered(-20.0, shielded_steps=150) is None
-    assert covered_fraction({"arms": {}, "references": {}}) is None
 
 
 def test_paired_differences_are_those_of_runs_with_equal_index():

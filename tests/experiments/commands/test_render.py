@@ -10,9 +10,8 @@ from PIL import Image
 
 from agents.loop import LoopConfig
 from agents.training import untrained
-from experiments.commands.render import render
+from experiments.commands.render import RenderSettings, render
 from experiments.runs.policies import policy_by_name
-from experiments.settings import RenderSettings
 from ncs_gym import Channel
 from ncs_gym.rendering import theme
 from tests.command import assert_one_sentence, ncs, succeeded

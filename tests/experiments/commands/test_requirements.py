@@ -41,7 +41,7 @@ def test_channel_refuses_a_file_in_one_sentence(content, words, tmp_path):
     (tmp_path / "packets.csv").write_text(content)
     other = ncs("channel", tmp_path / "packets.csv", "--sampling-period", 0.02, "--env", "ncs_gym/CSTR-v0")
     assert (other.returncode, other.stdout) == (2, "")
-    assert "a control step of the environment takes 3 s" in other.stderr
+    assert "a control step of the plant takes 3 s" in other.stderr
     found = ncs("channel", tmp_path / "packets.csv", "--sampling-period", 0.02)
     assert found.returncode != 0
     assert len(found.stderr.strip().splitlines()) == 1

@@ -6,15 +6,10 @@ import pytest
 from experiments.plots.heatmaps import sweep_map
 
 
-def cells(arms, losses=(0.0, 0.3, 0.6), delays=(0, 4), roundings=(None,), bursts=(1.0,), rate=None):
-    def numbers(at):
-        return {"runs": 2, "eval_violation_rate": 0.01 * at if rate is None else rate}
-
-    sides = ("loss", "delay", "quantization_step", "burst_length")
-    grid = product(losses, delays, roundings, bursts)
+def cells(arms, losses=(0.0, 0.3, 0.6), delays=(0, 4)):
     return [
-        dict(zip(sides, point, strict=True)) | {"mean_loss": point[0], "arms": {arm: numbers(at) for arm in arms}}
-        for at, point in enumerate(grid)
+        {"loss": loss, "delay": delay, "arms": {arm: {"runs": 2, "eval_violation_rate": 0.01 * at} for arm in arms}}
+        for at, (loss, delay) in enumerate(product(losses, delays))
     ]
 
 
@@ -41,21 +36,3 @@ def test_fields_stand_at_their_loss_and_delay():
     assert [tick.get_text() for tick in axis.get_xticklabels()] == ["0", "0.3", "0.6"]
     assert [tick.get_text() for tick in axis.get_yticklabels()] == ["0", "4"]
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("loss probability", "delay [steps]")
-
-
-def test_quantization_steps_and_bursts_have_panels_of_their_own():
-    grid = cells(["unshielded", "shielded"], roundings=(0.05, 0.1), bursts=(0.0, 3.0))
-    shown = panels(sweep_map(grid, ["unshielded", "shielded"]))
-    titles = [axis.get_title().replace(",\n", ", ") for axis in shown]
-    assert len(titles) == len(set(titles)) == 8
-    assert "shielded\nquantization 0.1, bursts of 3" in titles
-    assert "shielded\nquantization 0.1, independent losses" in titles
-
-
-def test_losses_of_commands_stand_against_losses_of_samples():
-    grid = [cell | {"downlink_loss": loss} for loss in (0.0, 0.4) for cell in cells(["shielded"], delays=(2,))]
-    figure = sweep_map(grid, ["shielded"])
-    (axis,) = panels(figure)
-    np.testing.assert_allclose(axis.images[0].get_array(), [[0.0, 1.0, 2.0]] * 2)
-    assert [tick.get_text() for tick in axis.get_yticklabels()] == ["0", "0.4"]
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("loss probability", "loss of commands")

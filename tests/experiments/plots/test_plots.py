@@ -9,7 +9,6 @@ from matplotlib.colors import to_hex
 
 from agents.results import TrainingPoint
 from experiments.analysis.episodes import episodes_table
-from experiments.baselines import CONTROLLERS, FILTERS, REGULATORS
 from experiments.plots import comparison_figures as comparison_module
 from experiments.plots.comparison_figures import (
     RATE_WINDOW,
@@ -17,7 +16,7 @@ from experiments.plots.comparison_figures import (
     comparison_figures,
     most_overridden,
 )
-from experiments.plots.figure_style import ArmStyle, arm_styles, thousands
+from experiments.plots.figure_style import arm_styles, thousands
 from tests.experiments.results import ALL_ARMS, history, run, summary_of, trajectory
 from tests.plants import random_plant
 
@@ -58,24 +57,29 @@ def by_color(axis):
     return {to_hex(line.get_color()).lower(): line for line in lines(axis)}
 
 
-def test_all_arms_look_different_and_a_penalty_keeps_the_color():
-    policies = (*CONTROLLERS, *REGULATORS, "untrained", "pretrained")
-    assert all(ArmStyle.of(f"{policy}{each}").marker for policy in policies for each in ("", "+shielded", "+psf:tube"))
-    assert all(ArmStyle.of(f"{each}{kind}").marker for each in FILTERS for kind in ("", "+penalty", " at test"))
-    looks = [ArmStyle.of(arm) for arm in ALL_ARMS]
-    assert len({(look.color, str(look.dashes)) for look in looks}) == len(ALL_ARMS)
-    assert len({(look.marker, look.hollow) for look in looks}) == len(ALL_ARMS)
-    assert ArmStyle.of("shielded:switch+penalty").color == ArmStyle.of("shielded:switch").color
+def test_all_arms_look_different_and_two_have_colors_of_their_own():
+    looks = arm_styles(ALL_ARMS)
+    assert len({(look.color, str(look.dashes)) for look in looks.values()}) == len(ALL_ARMS)
+    assert len({(look.marker, str(look.dashes)) for look in looks.values()}) == len(ALL_ARMS)
+    two = ["shielded", "unshielded"]
+    assert arm_styles(two) == {name: looks[name] for name in two}
+
+
+@pytest.mark.parametrize("seen", [np.eye(3), DEUTERANOPIA, PROTANOPIA])
+def test_color_blind_readers_can_tell_the_colors_apart(seen):
+    linear = {name: np.power(to_rgb(style.color), 2.2) for name, style in arm_styles(ALL_ARMS[:12]).items()}
+    shown = {arm: np.power(np.clip(seen @ color, 0.0, 1.0), 1 / 2.2) for arm, color in linear.items()}
+    for one, other in combinations(shown, 2):
+        assert np.linalg.norm(shown[one] - shown[other]) > 0.1, (one, other)
 
 
 def test_training_has_a_line_and_a_band_per_arm_and_interventions_only_of_watching_arms():
     axes = training_figure(arms("unshielded", "monitor", "shielded", runs=3)).axes
     assert [len(lines(axis)) for axis in axes] == [3, 3, 2]
     assert [len(bands(axis)) for axis in axes] == [3, 3, 2]
-    assert set(by_color(axes[2])) == {ArmStyle.of(name).color.lower() for name in ("monitor", "shielded")}
-    unwatched = training_figure(arms("unshielded", "penalized"))
-    assert len(unwatched.axes) == 2
-    assert "Interventions" not in unwatched.caption
+    styles = arm_styles(["unshielded", "monitor", "shielded"])
+    assert set(by_color(axes[2])) == {styles[name].color.lower() for name in ("monitor", "shielded")}
+    assert len(training_figure(arms("unshielded", "penalized")).axes) == 2
     figure = training_figure(arms("shielded", runs=3))
     (line,), (band,) = lines(figure.axes[1]), bands(figure.axes[1])
     np.testing.assert_allclose(line.get_xdata(), [0, 10, 20, 100])

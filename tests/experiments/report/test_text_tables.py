@@ -9,7 +9,7 @@ import pytest
 
 from experiments.commands.compare import findings_of
 from experiments.report.html import comparison_report
-from experiments.report.text_tables import proofs_text, scenario_text, summary_text, sweep_table
+from experiments.report.text_tables import scenario_text, summary_text, sweep_table
 from shields import Report
 from shields.verification.condition import flag
 from tests.experiments.results import run, summary_of
@@ -40,9 +40,7 @@ def comparison(runs=2):
 
 
 def cell(**changes):
-    own = {"loss": 0.3, "downlink_loss": None, "delay": 2, "quantization_step": None, "burst_length": 0.0}
-    given = own | {"mass_factor": None, "arms": comparison()["arms"]} | changes
-    return {"mean_loss": given["loss"]} | given
+    return {"loss": 0.3, "mean_loss": 0.3, "delay": 2, "arms": comparison()["arms"]} | changes
 
 
 def test_arms_that_nothing_filters_in_training_have_no_share_of_overridden_training_steps():
@@ -71,15 +69,14 @@ def test_no_table_prints_a_negative_zero(runs):
 
 def test_sweep_says_where_the_proof_did_not_hold():
     broken = cell(loss=0.6)
-    assert proofs_text([cell(), broken]) == ""
+    assert "The proof held in" not in sweep_table([cell(), broken])
     broken["arms"]["shielded"] |= {"guaranteed_episodes": 1, "eval_episodes": 4}
-    text = "The proof held in some evaluation episodes only: shielded at loss 0.6 (1 of 4)."
-    assert proofs_text([cell(), broken]) == text
+    text = "The proof held in some evaluation episodes only: shielded at loss 0.6, delay 2 (1 of 4)."
     assert " ".join(sweep_table([cell(), broken]).split()).endswith(text)
     many = [cell(loss=0.1 * k) for k in range(1, 10)]
     for each in many:
         each["arms"]["shielded"] |= {"guaranteed_episodes": 0, "eval_episodes": 4}
-    assert proofs_text(many).endswith("shielded at loss 0.6 (0 of 4) and 3 others.")
+    assert " ".join(sweep_table(many).split()).endswith("shielded at loss 0.6, delay 2 (0 of 4) and 3 others.")
 
 
 def test_training_has_a_table_only_where_something_was_trained():

@@ -6,9 +6,9 @@ from agents.hyperparams import DEFAULTS, with_changes
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from benchmarks.study import ENVS, TRAINED
 from experiments.baselines import EstimateFilter, tuned_training
+from experiments.commands.compare import CompareSettings
 from experiments.runs.arms import Arm, run_of_arm
 from experiments.runs.loops import certificate_of
-from experiments.settings import CompareSettings
 from shields import VectorSafetyShield
 
 

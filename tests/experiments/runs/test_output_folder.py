@@ -7,10 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from experiments.commands.compare import CompareSettings
+from experiments.commands.reproduce import ReproduceSettings
+from experiments.commands.sweep import SweepSettings
+from experiments.commands.train import TrainSettings
 from experiments.errors import OtherResultsError
 from experiments.runs.output_folder import claim_folder
-from experiments.settings import CompareSettings, ReproduceSettings, SweepSettings, TrainSettings
-from experiments.settings.arguments import registration_of
+from experiments.runs.provenance import registration_of
 from ncs_gym import Channel, Regulation, register_plant, truck_trailer
 
 
@@ -27,7 +30,6 @@ def finished(command, settings, file="summary.json"):
     ("command", "kind", "change", "words"),
     [
         ("compare", CompareSettings, {"seed": 1}, r"\(seed 0, now 1\)"),
-        ("compare", CompareSettings, {"noise": "gaussian"}, "noise"),
         ("compare", CompareSettings, {"channel": {"loss": 0.5}}, r"\(channel {}, now {'loss': 0.5}\)"),
         ("compare", CompareSettings, {"seed": 1, "algo": "SAC", "steps": 1, "episodes": 1}, r"; \.\.\.\)"),
         ("train", TrainSettings, {"arm": "unshielded"}, "arm"),
@@ -57,7 +59,7 @@ def test_folder_with_results_of_other_settings_is_refused(command, kind, change,
         ("compare", CompareSettings, {"jobs": 7, "smoke": True}),
         ("compare", CompareSettings, {"seeds": 4, "arms": (*CompareSettings.arms, "psf")}),
         ("sweep", SweepSettings, {"engine": "ray", "ray_address": "auto"}),
-        ("sweep", SweepSettings, {"losses": (0.9, 0.0, 0.3, 0.6), "burst_lengths": (0.0, 5.0)}),
+        ("sweep", SweepSettings, {"losses": (0.9, 0.0, 0.3, 0.6), "delays": (1,)}),
     ],
 )
 def test_what_changes_no_result_or_adds_to_them_is_taken(command, kind, change, tmp_path):

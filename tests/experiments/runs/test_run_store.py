@@ -6,8 +6,8 @@ import pytest
 from agents.loop import LagrangianSettings
 from experiments.backends.execution import results_of
 from experiments.baselines import EstimateFilterSettings
+from experiments.runs.output_folder import load, save
 from experiments.runs.provenance import versions
-from experiments.runs.run_store import load, save
 from experiments.settings import BackendSettings
 from tests.experiments.results import training_run
 
@@ -33,9 +33,9 @@ def test_stored_result_comes_back_exactly(folder, run, result):
     models = folder / "models" / run.name
     assert again.episodes == result.episodes
     assert repr(again.history) == repr(result.history)  # NaN equals nothing, itself included
-    assert {path.name: path.read_bytes() for path in models.iterdir()} == result.files
+    assert {path.name: path.read_bytes() for path in models.iterdir()} == again.files == result.files
     for episode in result.episodes:
-        path = run.trajectory(folder / "models", "as trained", episode.index)
+        path = run.trajectory(again.files, "as trained", episode.index)
         assert (len(path.inputs), path.intervened.sum()) == (episode.steps, episode.interventions)
 
 
@@ -119,7 +119,7 @@ def test_finished_runs_are_not_run_again(folder, run, result, tmp_path, monkeypa
     results = results_of([run, missing], tmp_path, BackendSettings(jobs=1))
     assert ran == [missing.name]
     assert [one.index for one in results] == [1, 2]
-    assert [one.files for one in results] == [{}, {}]  # those of many runs would fill the memory
+    assert [one.files for one in results] == [result.files] * 2
     assert "1 of 2 runs were finished before" in capsys.readouterr().err
     results_of([missing, run], tmp_path, BackendSettings(jobs=1))
     assert ran == [missing.name]

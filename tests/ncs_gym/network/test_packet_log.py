@@ -95,7 +95,6 @@ def test_stalls_are_counted_once_with_their_length_and_rate():
     assert rows[1]["broken"] == pytest.approx(0.5)
     assert rows[1]["times"] == 500
     assert rows[1]["per_hour"] == pytest.approx(500 / (200.0 / 3600.0))
-    assert rows[1]["halves"] == pytest.approx(2 * [rows[1]["per_hour"]])
     assert rows[1]["per_hour_ci95"][0] <= rows[1]["per_hour"] <= rows[1]["per_hour_ci95"][1]
 
 

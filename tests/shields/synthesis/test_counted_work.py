@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from experiments.commands.synthesize import SynthesizeSettings
 from experiments.commands.synthesize import synthesize as run_command
-from experiments.settings import SynthesizeSettings
 from ncs_gym import ChannelContract
 from shields import Infeasible, verify
 from shields.synthesis import ellipsoid_certificates, invariant_polytope, search

@@ -7,9 +7,11 @@ import pytest
 from agents import tuned_hyperparams, tuned_steps
 from agents.hyperparams import DEFAULTS
 from experiments.__main__ import parse
+from experiments.commands.compare import CompareSettings
+from experiments.commands.sweep import SweepSettings
+from experiments.commands.train import TrainSettings
 from experiments.runs.loops import loop_config
 from experiments.runs.training_run import require_trainable
-from experiments.settings import CompareSettings, SweepSettings, TrainSettings
 
 CART_POLE = "ncs_gym/CartPole-v0"
 

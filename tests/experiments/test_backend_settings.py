@@ -3,9 +3,10 @@ import sys
 import pytest
 
 from experiments.__main__ import COMMANDS
+from experiments.commands.compare import CompareSettings
+from experiments.commands.sweep import SweepSettings
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, lasting_settings
-from experiments.settings.learning import CompareSettings, SweepSettings
 from tests.command import assert_one_sentence, ncs
 
 

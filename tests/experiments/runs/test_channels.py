@@ -1,18 +1,11 @@
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from experiments.commands.sweep import grid_points, loop_at, name_of
-from experiments.runs.arms import run_of_arm
-from experiments.runs.loops import certificate_of, changed_channel, losses_text
-from experiments.settings.learning import SweepSettings
-from ncs_gym import Channel, ChannelContract, GilbertElliott
-from ncs_gym.envs.env import ncs_env
+from experiments.runs.loops import changed_channel
+from ncs_gym import Channel, GilbertElliott
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.processes import PendulumProcess
-from shields import certificate_for
 
 OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 
@@ -61,12 +54,6 @@ def test_a_channel_that_loses_only_so_many_in_a_row_loses_fewer_than_asked_for()
         changed_channel(own, {"loss": 0.8, "burst_length": 12.0})
     longer = changed_channel(own, {"loss": 0.8, "burst_length": 12.0, "max_consecutive_losses": 40})
     assert longer.max_consecutive_losses == 40
-    cells = [{"loss": 0.8, "burst_length": 5.0, "mean_loss": channel.mean_loss}]
-    assert losses_text(cells) == (
-        "Channels lose only so many packets in a row, so that fewer are lost than asked for: "
-        f"{channel.mean_loss:.3f} for 0.8 in bursts of 5."
-    )
-    assert losses_text([{"loss": 0.8, "burst_length": 0.0, "mean_loss": 0.8}]) == ""
 
 
 def test_bursts_need_a_loss_probability():
@@ -76,32 +63,3 @@ def test_bursts_need_a_loss_probability():
     given = {"burst_length": 3.0, "loss": 0.2}
     assert changed_channel(own, given).loss == changed_channel(Channel(), given).loss
     assert changed_channel(OWN, {"burst_length": 3.0}).loss == changed_channel(OWN, given | {"loss": 0.3}).loss
-
-
-def test_grid_is_the_product_of_its_sides():
-    settings = SweepSettings(losses=(0.0, 0.5), delays=(1,), quantization_steps=(0.1, 0.2), burst_lengths=(0.0, 3.0))
-    points = grid_points(settings)
-    assert len(points) == len({name_of(point) for point in points}) == 8
-    lossless, *_, last = points
-    own = replace(settings, channel={"jitter": 1})
-    assert loop_at(own, lossless).channel == Channel(0.0, quantization_step=0.1, send_period=2, delay=1, jitter=1)
-    bursts = changed_channel(OWN, {"loss": 0.5, "burst_length": 3.0}).loss
-    assert loop_at(settings, last).channel == Channel(bursts, quantization_step=0.2, send_period=2, delay=1)
-
-
-def test_masses_are_a_side_of_the_grid():
-    settings = SweepSettings(losses=(0.3,), delays=(0,), mass_factors=(0.9, 1.0, 1.1))
-    points = grid_points(settings)
-    assert [point["mass_factor"] for point in points] == [0.9, 1.0, 1.1]
-    assert len({name_of(point) for point in points}) == 3
-    loop = loop_at(replace(settings, env="ncs_gym/Pendulum-v0"), points[0])
-    run = run_of_arm(settings.completed, loop, certificate_of(loop), "shielded", 0)
-    assert ncs_env(run.loop.single()).process == PendulumProcess(mass=0.9)
-    assert (
-        run.certificate.checksum == certificate_for(ncs_env(loop.single()).plant, ChannelContract(2)).checksum
-    )  # the model's
-
-
-def test_points_that_print_alike_have_names_of_their_own():
-    points = grid_points(SweepSettings(losses=(0.9, 0.90000001), delays=(0,)))
-    assert len({name_of(point) for point in points}) == 2
