@@ -12,7 +12,7 @@ from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import Rest
 from shields.synthesis.diagnosis import infeasibility, with_age_that_helps
-from shields.synthesis.ellipsoid_certificates import certify, largest_ellipsoid, with_tolerated_scale
+from shields.synthesis.ellipsoid_certificates import FoundEllipsoid, certify, largest_ellipsoid, with_tolerated_scale
 from shields.synthesis.polytope_certificates import (
     around_resting_point,
     certify_polytope,
@@ -21,6 +21,7 @@ from shields.synthesis.polytope_certificates import (
 )
 from shields.synthesis.resting_point import at_operating_point, needs_resting_point, resting_at
 from shields.synthesis.search import Progress, Search
+from shields.synthesis.tolerance import most_tolerated
 from shields.verification import verify
 
 # Alternations of a search that begins near the design of a similar problem.
@@ -96,30 +97,33 @@ def _found(
     Raises:
         TimeoutError, KeyboardInterrupt: Where the search is ended; it holds what was reached.
     """
-    failure: Infeasible | None = None
+    ellipsoid: FoundEllipsoid | None = None
     try:
-        if rest is not None or needs_resting_point(plant):
-            return around_resting_point(plant, contract, search, rest)
-        ellipsoid = largest_ellipsoid(plant, contract, search)
-        if ellipsoid.certificate is not None:
-            found = with_tolerated_scale(ellipsoid.certificate, ellipsoid.problem)
-            search.candidate = lambda: found
-            return with_polytope(found, plant, search) if polytope else found
-        search.candidate, failure = None, ellipsoid.failure
-        if not polytope:
-            raise failure or infeasibility(plant, contract, polytope=False)
-        known = [] if ellipsoid.K is None else [ellipsoid.K]
-        found = around_resting_point(plant, contract, search, at_operating_point(plant), known)
-        return with_tolerated_scale(found, ellipsoid.problem)
-    except Infeasible as none:
-        if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
-            given = "this is around the resting_state that was given, without one the synthesis chooses"
-            raise Infeasible(f"{none}; {given}", none.binding, none.shortfall) from None
-        if none.binding == "P":
-            search.refusal = failure or infeasibility(plant, contract, polytope=True, reason=str(none))
+        fixed, known = rest, None
+        if rest is None and not needs_resting_point(plant):
+            ellipsoid = largest_ellipsoid(plant, contract, search)
+            if ellipsoid.certificate is not None:
+                found = with_tolerated_scale(ellipsoid.certificate, plant, ellipsoid.problem)
+                search.candidate = lambda: found
+                return with_polytope(found, plant, search) if polytope else found
+            search.candidate, fixed = None, at_operating_point(plant)
+            known = [] if ellipsoid.K is None else [ellipsoid.K]
+        if polytope:
+            alone = around_resting_point(plant, contract, search, fixed, known)
+            if (certificate := alone.certificate) is not None:
+                return with_tolerated_scale(certificate, plant, ellipsoid.problem) if ellipsoid else certificate
+            tolerated, reason = alone.tolerated, alone.reason
         else:
-            search.refusal = none
-        raise _with_age(search.refusal, plant, contract, search, polytope=polytope) from None
+            tolerated, reason = most_tolerated(plant, contract, polytope=False), ""
+        refusal = ellipsoid.failure if ellipsoid else None
+        refusal = refusal or infeasibility(plant, tolerated, polytope=polytope, reason=reason)
+    except Infeasible as none:
+        refusal = none
+    if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
+        given = "this is around the resting_state that was given, without one the synthesis chooses"
+        raise Infeasible(f"{refusal}; {given}", refusal.binding, refusal.shortfall)
+    search.refusal = refusal
+    raise _with_age(refusal, plant, contract, search, polytope=polytope)
 
 
 def _with_age(
@@ -186,7 +190,7 @@ def nearby_certificate(
             if ellipsoid.certificate is not None or carried is not None or not polytope:
                 return ellipsoid.certificate or carried
             known = [] if ellipsoid.K is None else [ellipsoid.K]
-        found = around_resting_point(plant, contract, progress, rest, known)
+        found = around_resting_point(plant, contract, progress, rest, known).certificate
     except Infeasible:
         return carried
-    return found if carried is None else max(found, carried, key=polytope_share)
+    return max(filter(None, [found, carried]), key=polytope_share, default=None)

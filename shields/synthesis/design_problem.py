@@ -29,8 +29,6 @@ INFLATION = 1.0 + 1e-9
 # Axes of an error set are lengthened to at least this fraction of its longest one in the semidefinite programs; exact
 # verification uses the error set itself.
 _SMALLEST_AXIS_RATIO = 0.01
-# What stands for nothing or less that the bound between samples leaves of a limit.
-_NOTHING_LEFT = 1e-9
 # A box that is longer in one direction than in another by more, each state in units of its own limit, is refused.
 _FLATTEST = 1e7
 # Of the longest direction those states are named whose part in it is at least this much of the largest one.
@@ -61,23 +59,6 @@ class SymmetricLimits(NamedTuple):
     u_max: np.ndarray
 
 
-class ScaledGrid(NamedTuple):
-    """The g rows |state z + input u| + disturbed <= 1 of the box at times between samples; none without a grid.
-
-    They are divided by what the bound between these times and the rounding of actions leave (docs/shield_proof.md,
-    "Between the samples").
-
-    Attributes:
-        state: Rows on scaled states, shape (g, n).
-        input: Rows on scaled inputs, shape (g, m).
-        disturbed: Supports of the disturbance that has come by then, shape (g,).
-    """
-
-    state: np.ndarray
-    input: np.ndarray
-    disturbed: np.ndarray
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DesignProblem:
     """The plant in scaled coordinates z = T^-1 x and u / u_max, with T T' the largest ellipsoid in the safe box.
@@ -88,7 +69,6 @@ class DesignProblem:
         C: Rows of the safe box in scaled coordinates, shape (k, n).
         D_u: Shape of the disturbance set with the rounding of actions (docs/shield_proof.md), scaled, (n, n).
         error_shapes: Shapes of the error sets for which K x_hat must be safe, scaled, (k, n, n).
-        grid: What the box says at times between samples. The semidefinite programs know nothing of it.
         transform: The transformation T, shape (n, n).
         u_max: Input limits in physical units, shape (m,).
         rounding: Multiplier s of D_u.
@@ -99,7 +79,6 @@ class DesignProblem:
     C: np.ndarray
     D_u: np.ndarray
     error_shapes: np.ndarray
-    grid: ScaledGrid
     transform: np.ndarray
     u_max: np.ndarray
     rounding: float
@@ -199,6 +178,10 @@ def design_problem(
             flatness,
         )
     try:
+        _ = plant.grid_rows
+    except OverflowError as error:
+        raise Infeasible(f"(B) {error}", "B", 1.0) from error
+    try:
         errors = certified_error_set(plant, contract).larger(INFLATION)
     except UnstablePlantError as error:
         raise Infeasible(
@@ -233,26 +216,10 @@ def _scaled(plant: LinearPlant, error_shapes: np.ndarray, limits: SymmetricLimit
         C=box_rows @ T,
         D_u=inverse @ D_u @ inverse.T,
         error_shapes=inverse @ error_shapes @ inverse.T,
-        grid=_scaled_grid(plant, T, u_max),
         transform=T,
         u_max=u_max,
         rounding=s,
     )
-
-
-def _scaled_grid(plant: LinearPlant, transform: np.ndarray, u_max: np.ndarray) -> ScaledGrid:
-    """Returns the plant's rows between samples in scaled coordinates z = T^-1 x and u / u_max."""
-    try:
-        grid = plant.grid_rows
-        if grid is None:
-            return ScaledGrid(np.empty((0, plant.n)), np.empty((0, plant.m)), np.empty(0))
-    except OverflowError as error:
-        raise Infeasible(f"(B) {error}", "B", 1.0) from error
-    state, pushed, _ = grid
-    taken, disturbed = taken_between_samples(plant, grid, plant.disturbance.shape_matrix)
-    left = np.maximum(1.0 - taken, _NOTHING_LEFT)
-    rows, inputs = state @ transform / left[..., None], pushed * u_max / left[..., None]
-    return ScaledGrid(rows.reshape(-1, plant.n), inputs.reshape(-1, plant.m), (disturbed / left).ravel())
 
 
 def taken_between_samples(plant: LinearPlant, grid: GridRows, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,8 +19,9 @@ from shields.synthesis.design_problem import CandidateDesign, DesignProblem, Sym
 from shields.synthesis.invariant_polytope import feedback_of, limits_within_step
 from shields.synthesis.max_margin_gain import max_margin_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers
-from shields.synthesis.polytope_gain import ellipsoid_margin, polytope_margin
+from shields.synthesis.resting_point import at_operating_point
 from shields.synthesis.search import Search
+from shields.synthesis.tolerance import Tolerance, of_ellipsoid
 from shields.verification import Report, verify
 
 # Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly: the search takes
@@ -136,7 +137,7 @@ def largest_ellipsoid(
     return FoundEllipsoid(problem, None, K, failure)
 
 
-def with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Certificate:
+def with_tolerated_scale(certificate: Certificate, plant: LinearPlant, problem: DesignProblem) -> Certificate:
     """Returns a certificate with a record of how much larger all radii could be for some set and gain.
 
     It is 1 at least, because this certificate exists: the search for a larger one is local, and covers the error sets
@@ -144,9 +145,10 @@ def with_tolerated_scale(certificate: Certificate, problem: DesignProblem) -> Ce
     """
     if certificate.keeps_ellipsoid:
         gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
-        scale = 1.0 if gain is None else ellipsoid_margin(problem, gain)
+        found = None if gain is None else of_ellipsoid(plant, problem, gain)
     else:
-        scale = polytope_margin(problem, problem.to_scaled(certificate.L, certificate.K)[1])
+        found = Tolerance(plant, certificate.error_shapes, certificate.D, at_operating_point(plant)).of(certificate.K)
+    scale = 1.0 if found is None else found.margin
     record = {"tolerated_scale": float(exact.rounded(max(scale, 1.0), 3))}
     return replace(certificate, provenance=certificate.provenance | record)
 

@@ -8,7 +8,7 @@ that is a row again. What a linear program shows to hold already is not added. A
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -27,12 +27,11 @@ from shields.verification import ACTION_ROUNDING
 # published plant that has a polytope. They are counted, not timed: the speed of a machine decides no certificate.
 MOST_FOLLOWED = 2000
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
-# and for what others imply only up to some part of it. Where one makes too many rows, a larger one makes fewer.
-MARGINS = (1e-6, 2e-5, 6e-5, 2e-4)
+# and for what others imply only up to some part of it. Where one makes too many rows, a larger one makes fewer; the
+# last one is for fallbacks that bear little more than their radii and leave no room for the larger ones.
+MARGINS = (1e-6, 2e-5, 6e-5, 2e-4, 6e-6)
 # A row counts as implied by others up to this; next to the larger margin, up to this part of it.
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
-# In the details of an `Infeasible`: it is the limits of rows that end the search.
-_TOO_LARGE = "too_large"
 # States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
 _SIMILAR = 1.0
 # A search that had too many rows has too many again once it has grown by this factor.
@@ -45,6 +44,14 @@ _POINTS_LOG2 = 16
 _LEAST_POINTS = 4000
 # Steps after which it must be known which points a gain keeps in the box.
 _MOST_STEPS = 3000
+
+
+class TooManyRowsError(Infeasible):
+    """There may be a polytope, but not within the limits of rows."""
+
+    def __init__(self, reason: str) -> None:
+        """Begins with the reason."""
+        super().__init__(reason, "P", 0.0)
 
 
 class Feedback(NamedTuple):
@@ -82,10 +89,10 @@ def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces
     return Faces(rows / half[:, None], low / half, high / half)
 
 
-def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]) -> Polytope:
-    """Returns the largest polytope that a fallback keeps invariant, not yet verified.
-
-    Where it would have too many rows, it is one that is nearly as large and has fewer.
+def invariant_polytopes(
+    feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]
+) -> Iterator[Polytope]:
+    """Yields the largest polytopes that a fallback keeps invariant, not yet verified, with one margin after the other.
 
     Args:
         feedback: The fallback.
@@ -95,27 +102,25 @@ def invariant_polytope(feedback: Feedback, plant: LinearPlant, progress: Callabl
     Raises:
         Infeasible: If there is none within `MOST_ROWS` rows, `MOST_FOLLOWED` of them followed; the message says why.
     """
-    too_large: Infeasible | None = None
+    failure: Infeasible | None = None
     for margin in MARGINS:
         implied = _IMPLIED if margin == MARGINS[0] else _NEARLY_IMPLIED * margin
         try:
-            return _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied)
+            yield _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied)
+            failure = failure or Infeasible("its numbers are out of reach", "P", 0.0)
+        except TooManyRowsError as too_many:
+            failure = too_many
+            progress(f"polytope: {failure}")
         except Infeasible as infeasible:
-            if not _is_too_large(infeasible):  # with a smaller margin it is a matter of rows
-                raise (too_large or infeasible) from None
-            too_large = infeasible
-            progress(f"polytope: {infeasible}")
-    assert too_large is not None
-    raise too_large
-
-
-def _is_too_large(infeasible: Infeasible) -> bool:
-    """Returns whether there may be a polytope, but not within the limits of rows."""
-    return _TOO_LARGE in infeasible.details
+            failure = failure or infeasible
+            if margin == min(MARGINS):  # a larger one leaves less
+                break
+    if failure is not None:
+        raise failure
 
 
 def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: float) -> Polytope:
-    """Returns what `invariant_polytope` does, of rows that cut by more than `implied`.
+    """Returns a polytope of `invariant_polytopes`, of rows that cut by more than `implied`.
 
     A state along which it would have no end gets the limit within which its gain was sought.
     """
@@ -182,7 +187,7 @@ def _faces_that_cut(
                 raise _too_many()
             within, most = Extremes(faces), max(MOST_ROWS, int(_GROWN * len(faces.rows)))
         if followed >= MOST_FOLLOWED:
-            raise _too_large(f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps")
+            raise TooManyRowsError(f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps")
         if following % 50 == 0:
             progress(f"polytope: {len(within.faces.rows)} rows")
         row = predecessor(within.faces.some([following]))
@@ -255,7 +260,7 @@ def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
 def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) -> float:
     """Returns what share of points of the safe box a fallback keeps in it for ever.
 
-    They are those of the polytope of `invariant_polytope`, found without linear programs, and without the limit of
+    They are those of the polytope of `invariant_polytopes`, found without linear programs, and without the limit of
     rows. 0.0 where there is no such polytope, or `_MOST_STEPS` steps do not tell.
 
     Args:
@@ -414,13 +419,8 @@ def _none(reason: str) -> Infeasible:
     return Infeasible(reason, "P", 0.0)
 
 
-def _too_large(reason: str) -> Infeasible:
-    """There may be a polytope, but not within the limits of rows."""
-    return Infeasible(reason, "P", 0.0, {_TOO_LARGE: 1.0})
-
-
-def _too_many() -> Infeasible:
-    return _too_large(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
+def _too_many() -> TooManyRowsError:
+    return TooManyRowsError(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
 
 
 def _extents(faces: Faces) -> np.ndarray:

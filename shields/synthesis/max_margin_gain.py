@@ -44,7 +44,7 @@ class MaxMarginGain:
 
 
 def max_margin_gain(
-    problem: DesignProblem, Sigma: np.ndarray, *, input_limits: bool = True, searches: int = _LOCAL_SEARCHES
+    problem: DesignProblem, Sigma: np.ndarray, *, searches: int = _LOCAL_SEARCHES
 ) -> MaxMarginGain | None:
     """Returns the gain that tolerates the largest radii; None if no stabilizing gain is found.
 
@@ -55,10 +55,9 @@ def max_margin_gain(
     Args:
         problem: The scaled design problem.
         Sigma: Shape of the error set, scaled, (n, n).
-        input_limits: False drops (U), which tells whether the input limits are what binds.
         searches: Number of regulators, those of largest margin, that the search begins at.
     """
-    search = _GainSearch(problem, Sigma, input_limits)
+    search = _GainSearch(problem, Sigma)
     initial = sorted(_initial_points(problem), key=search.largest_use)[:searches]
     improved = [search.improved(point) for point in initial]
     best = min(improved, key=search.largest_use, default=None)
@@ -84,8 +83,8 @@ def _initial_points(problem: DesignProblem) -> list[np.ndarray]:
 class _GainSearch:
     """How much of each limit a gain uses, as a function of the point (K, logit of lx, logit of le / (1 - lx))."""
 
-    def __init__(self, problem: DesignProblem, Sigma: np.ndarray, input_limits: bool) -> None:
-        self._problem, self._Sigma, self._input_limits = problem, Sigma, input_limits
+    def __init__(self, problem: DesignProblem, Sigma: np.ndarray) -> None:
+        self._problem, self._Sigma = problem, Sigma
         self._gain_shape = problem.m, problem.n
         self._last_point, self._last_uses = b"", (np.empty(0), np.empty((0, 0)))
 
@@ -147,7 +146,7 @@ class _GainSearch:
         A functional tr(Z L) changes by tr(Y dS) + 2 tr(Y dF L F') with the adjoint Y = F'YF + Z.
         """
         problem, (K, lx, fraction) = self._problem, self._unpacked(point)
-        C, rows = problem.C, K if self._input_limits else K[:0]
+        C, rows = problem.C, K
         unstable = np.full(len(C) + len(rows), _UNSTABLE_USE), np.zeros((len(C) + len(rows), len(point)))
         if not (np.isfinite(K).all() and np.abs(np.linalg.eigvals(problem.A + problem.B @ K)).max() ** 2 < lx):
             return unstable

@@ -10,11 +10,12 @@ from scipy.linalg import null_space
 from scipy.optimize import linprog
 
 from ncs_gym import LinearPlant, exact
-from ncs_gym.plants.hard_bounds import weight_of
+from ncs_gym.plants.hard_bounds import inflated, weight_of
 from ncs_gym.plants.lqr import lqr_gain
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import shown
 from shields.errors import Infeasible
-from shields.synthesis.design_problem import Rest, SymmetricLimits
+from shields.synthesis.design_problem import Rest, SymmetricLimits, taken_between_samples
 
 # Significant digits of a resting point, in units of the limits: what differs between processors is beyond them.
 _DIGITS = 12
@@ -29,6 +30,8 @@ _GENEROUS = 2.0
 _STEPS_OF_REACH = 400
 # What limits see of a direction less than this, in which they are about 1 away, is rounding.
 _UNSEEN = 1e-9
+# What an equilibrium lacks is computed with an error of at most this, relative to its terms.
+_OF_REST = 1e-14
 # A limit binds if more of what all nearest ones leave is due to it.
 _LEAST_PRICE = 1e-3
 
@@ -45,12 +48,43 @@ def equilibria(plant: LinearPlant) -> np.ndarray:
     return scale[:, None] * null_space(balance * scale)
 
 
-def _limit_rows(plant: LinearPlant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the rows of all limits on (x, u), in units of half their range, and their ends."""
+class LimitRows(NamedTuple):
+    """All limits low <= rows (x, u) <= high, in units of half their range: of the box, the inputs, of both together.
+
+    With what disturbances are given, the box at the times of the plant's grid follows, time by time.
+
+    Attributes:
+        rows: Shape (r, n + m).
+        low, high: Shape (r,).
+        disturbed: Support of what has come by then of the disturbance, shape (r,); 0 but at times of the grid.
+    """
+
+    rows: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    disturbed: np.ndarray
+
+
+def limit_rows(plant: LinearPlant, D: np.ndarray | None = None) -> LimitRows:
+    """Returns the limits of a plant, and for disturbances of the shape D, (n, n), those between samples."""
     box = np.hstack([plant.box, np.zeros((len(plant.box), plant.m))])
     inputs = np.hstack([np.zeros((plant.m, plant.n)), np.diag(1.0 / plant.input_half)])
-    ends = plant.box_ends, plant.input_ends / plant.input_half, plant.mixed_ends
-    return np.concatenate([box, inputs, plant.mixed_rows]), *np.concatenate(ends, axis=1)
+    rows = np.concatenate([box, inputs, plant.mixed_rows])
+    ends = np.concatenate([plant.box_ends, plant.input_ends / plant.input_half, plant.mixed_ends], axis=1)
+    disturbed = np.zeros(len(rows))
+    if D is not None and (grid := plant.grid_rows) is not None:
+        taken, by_disturbance = taken_between_samples(plant, grid, D)
+        rows = np.concatenate([rows, np.concatenate([grid.state, grid.input], axis=2).reshape(-1, rows.shape[1])])
+        left = np.tile(plant.box_ends, len(taken)) + np.outer([1.0, -1.0], taken.ravel())
+        ends = np.concatenate([ends, left], axis=1)
+        disturbed = np.concatenate([disturbed, np.tile(by_disturbance, len(taken))])
+    return LimitRows(rows, ends[0], ends[1], disturbed)
+
+
+def around(limits: LimitRows, rest: Rest) -> LimitRows:
+    """Returns the limits of deviations from a point."""
+    reached = limits.rows @ np.concatenate(rest)
+    return limits._replace(low=limits.low - reached, high=limits.high - reached)
 
 
 def needs_resting_point(plant: LinearPlant) -> bool:
@@ -81,19 +115,22 @@ def farthest_from_limits(plant: LinearPlant) -> Rest:
     return farthest_equilibrium(plant).rest
 
 
-def farthest_equilibrium(plant: LinearPlant, needs: np.ndarray | None = None) -> Farthest:
+def farthest_equilibrium(
+    plant: LinearPlant, needs: np.ndarray | None = None, limits: LimitRows | None = None
+) -> Farthest:
     """Returns the equilibrium whose nearest limit is farthest away with the limits that are nearest.
 
     It is found by a linear program.
 
     Args:
         plant: The plant.
-        needs: What distances from the limits are in units of, shape (k + m + q,), > 0; half the range by default.
+        needs: What distances from the limits are in units of, shape (r,), > 0; half the range by default.
+        limits: The r limits; those of `limit_rows` by default.
 
     Raises:
         Infeasible: If no equilibrium is strictly within the limits.
     """
-    directions, (rows, low, high) = equilibria(plant), _limit_rows(plant)
+    directions, (rows, low, high, _) = equilibria(plant), limits or limit_rows(plant)
     reached, needed = rows @ directions, np.ones((len(rows), 1)) if needs is None else needs[:, None]
     above, below = np.isfinite(high), np.isfinite(low)
     faces = np.concatenate([np.hstack([reached, needed])[above], np.hstack([-reached, needed])[below]])
@@ -151,9 +188,8 @@ def distances(plant: LinearPlant, rest: Rest) -> np.ndarray:
 
     Of the k rows of the box, of the m inputs, and of the q limits of both together.
     """
-    rows, low, high = _limit_rows(plant)
-    values = rows @ np.concatenate(rest)
-    return np.minimum(values - low, high - values)
+    ends = around(limit_rows(plant), rest)
+    return np.minimum(-ends.low, ends.high)
 
 
 def limits_around(plant: LinearPlant, rest: Rest) -> SymmetricLimits:
@@ -170,6 +206,16 @@ def limits_around(plant: LinearPlant, rest: Rest) -> SymmetricLimits:
     if exact.rank(plant.box) < plant.n:
         rows = np.concatenate([rows, _generous_rows(plant, rows, u_max)])
     return SymmetricLimits(rows, u_max)
+
+
+def disturbance_around(plant: LinearPlant, rest: Rest) -> np.ndarray:
+    """Returns D with what a resting point lacks of an equilibrium, shape (n, n)."""
+    missing = plant.A @ rest.state + plant.B @ rest.input - rest.state
+    D = plant.disturbance.shape_matrix
+    if missing.any():
+        missing = np.abs(missing) + _OF_REST * (np.abs(plant.A) @ np.abs(rest.state) + np.abs(rest.state))
+        D = outer_sum(D, plant.n * np.diag(missing**2), plant.relative_weight)
+    return inflated(D)
 
 
 def units_of_states(plant: LinearPlant, rest: Rest) -> np.ndarray:

@@ -293,7 +293,7 @@ def test_infeasible_problem_is_one_sentence(tmp_path):
     with feasible_age_not_sought():
         run = ncs("synthesize", "--plant", "plant.json", cwd=tmp_path)
     assert run.returncode == 2
-    assert run.stderr.splitlines()[-1].startswith("ncs: (I) no invariant ellipsoid or polytope in the box was found")
+    assert run.stderr.splitlines()[-1].startswith("ncs: (I) no invariant set within the limits was found")
     assert [path.name for path in tmp_path.iterdir()] == ["plant.json"]
 
 

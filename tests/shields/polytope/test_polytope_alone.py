@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ncs_gym import ChannelContract
+from benchmarks.published import contract_of_plant, plant_of
+from ncs_gym import ChannelContract, batch_reactor, certified_error_set
 from shields import Infeasible
+from shields.synthesis import polytope_certificates
 from shields.synthesis.certification import carried_over, nearby_certificate
-from shields.synthesis.design_problem import design_problem
-from shields.synthesis.max_margin_gain import max_margin_gain
+from shields.synthesis.invariant_polytope import share_in_polytope
 from shields.synthesis.polytope_certificates import certify_polytope
-from shields.synthesis.polytope_gain import most_tolerant_gain, polytope_margin
+from shields.synthesis.resting_point import at_operating_point
+from shields.synthesis.tolerance import Tolerance, most_tolerated, regulators
+from shields.verification import verify
 from tests.certificates import certificate_of, feasible_age_not_sought
 from tests.plants import named, servo, with_radii
 from tests.product import synthesize
@@ -46,42 +51,83 @@ def test_ellipsoid_that_is_asked_for_is_infeasible_where_only_a_polytope_is_foun
         synthesize(found(name)[1], contract=AGE, safe_set="ellipsoid")
 
 
+def tolerance_of(plant, contract):
+    """What gains bear around the operating point of a plant, and its error sets."""
+    errors = certified_error_set(plant, contract).promised
+    return Tolerance(plant, errors, plant.disturbance.shape_matrix, at_operating_point(plant)), errors
+
+
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_margin_of_a_gain_is_what_errors_and_disturbances_reach_together(seed):
     """There are signals that reach the sum of supports; 0.99 times the margin certifies, 1.02 times does not."""
     rng, plant = np.random.default_rng(seed), servo(1.0)
-    problem, _ = design_problem(plant, AGE)
-    gain = max_margin_gain(problem, problem.covering_error_shape)
-    K = gain.K * (1.0 + 0.1 * rng.standard_normal(gain.K.shape))
-    margin = polytope_margin(problem, K)
-    closed_loop, reached = problem.A + problem.B @ K, []
-    for row in (*problem.C, *K):
-        x, pushes, used = np.zeros(2), [row], 0.0
-        while np.abs(pushes[-1]).max() > 1e-12:
+    tolerance, errors = tolerance_of(plant, AGE)
+    K = most_tolerated(plant, AGE, polytope=False).K
+    K = K * (1.0 + 0.1 * rng.standard_normal(K.shape))
+    margin, D = tolerance.of(K).margin, plant.disturbance.shape_matrix
+    closed_loop, reached = plant.A + plant.B @ K, []
+    inputs = K / plant.input_half[:, None]
+    for number, row in enumerate((*plant.box_rows, *inputs)):
+        x, pushes = np.zeros(2), [row]
+        while np.abs(pushes[-1] / row.max()).max() > 1e-12:
             pushes.append(pushes[-1] @ closed_loop)
         for push in reversed(pushes[:-1]):  # each step pushes the row where it will end
-            supports = [np.sqrt(push @ problem.B @ K @ S @ (push @ problem.B @ K)) for S in problem.error_shapes]
-            S = problem.error_shapes[int(np.argmax(supports))]
-            e = S @ (push @ problem.B @ K) / max(supports)
-            d = problem.D_u @ push / np.sqrt(push @ problem.D_u @ push)
-            x = closed_loop @ x + problem.B @ (K @ e) + d
+            supports = [np.sqrt(push @ plant.B @ K @ S @ (push @ plant.B @ K)) for S in errors]
+            S = errors[int(np.argmax(supports))]
+            e = S @ (push @ plant.B @ K) / max(supports)
+            d = D @ push / np.sqrt(push @ D @ push)
+            x = closed_loop @ x + plant.B @ (K @ e) + d
         used = row @ x
-        if any(np.array_equal(row, own) for own in K):
-            used += max(np.sqrt(row @ S @ row) for S in problem.error_shapes)
+        if number >= len(plant.box_rows):
+            used += max(np.sqrt(row @ S @ row) for S in errors)
         reached.append(used)
     assert 1.0 / max(reached) == pytest.approx(margin, rel=1e-6)
-    _, physical = problem.to_physical(np.eye(2), K)
-    certified = [certify_polytope(with_radii(plant, f * margin), physical, AGE) for f in (0.99, 1.02)]
+    certified = [certify_polytope(with_radii(plant, f * margin), K, AGE) for f in (0.99, 1.02)]
     assert certified[0] is not None
     assert certified[1] is None
 
 
+@pytest.mark.parametrize("make", [lambda: servo(1.0), lambda: servo(1.0, between_samples=4), batch_reactor])
+def test_derivatives_of_what_a_gain_needs_are_those_of_differences(make):
+    plant, rng = make(), np.random.default_rng(0)
+    tolerance, _ = tolerance_of(plant, ChannelContract(1))
+    K = tolerance._scaled(regulators(plant)[2])
+    step = 1e-6 * np.abs(K).max() * rng.standard_normal(K.shape)
+    (_, slopes), *needs = (tolerance._needs_and_slopes(each) for each in (K, K + step, K - step))
+    np.testing.assert_allclose(
+        (slopes * step).sum(axis=(1, 2)), 0.5 * (needs[0][0] - needs[1][0]), rtol=1e-4, atol=1e-12
+    )
+
+
+def test_most_tolerant_gain_is_the_same_wherever_its_search_begins():
+    plant, contract = plant_of("double_integrator"), contract_of_plant("double_integrator")
+    tolerance, _ = tolerance_of(plant, contract)
+    starts = regulators(plant)
+    assert [tolerance.improved(K).margin for K in starts] == pytest.approx(len(starts) * [0.60752], abs=2e-5)
+    # A refusal names what this search finds.
+    with feasible_age_not_sought(), pytest.raises(Infeasible, match=r"radii shrink to 60.8% of those given") as told:
+        synthesize(plant, contract=contract)
+    assert told.value.details["share_of_radii"] == pytest.approx(0.60752, abs=2e-5)
+
+
+def test_polytope_that_fails_the_exact_check_is_sought_with_a_larger_margin(monkeypatch):
+    plant, checked = servo(1.0), []
+
+    def strict(certificate, plant):
+        checked.append(certificate)
+        return verify(certificate if len(checked) > 1 else replace(certificate, K=2.0 * certificate.K), plant)
+
+    monkeypatch.setattr(polytope_certificates, "verify", strict)
+    found = certify_polytope(plant, most_tolerated(plant, AGE, polytope=True).K, AGE)
+    assert verified(found, plant).valid
+    assert len(checked) == 2
+    assert share_in_polytope(found.polytope, plant) <= share_in_polytope(checked[0].polytope, plant)
+
+
 def test_more_tolerant_gain_is_found_and_carried_over_to_easier_problems():
     plant = servo(1.0)
-    problem, _ = design_problem(plant, AGE)
-    start = max_margin_gain(problem, problem.covering_error_shape)
-    margin = most_tolerant_gain(problem, start).margin
-    assert margin >= polytope_margin(problem, start.K) > 1.15 * start.margin
+    margin = most_tolerated(plant, AGE, polytope=True).margin
+    assert margin > 1.15 * most_tolerated(plant, AGE, polytope=False).margin
     hardest = with_radii(plant, 0.98 * margin)
     certificate = nearby_certificate(hardest, AGE)
     assert not certificate.keeps_ellipsoid

@@ -78,7 +78,9 @@ def test_units_of_inputs_do_not_matter():
     certificate = certificate_of(plant)
     tiny = altered(plant, B=plant.B * 1e39, u_max=plant.u_max * 1e-39)
     K = certificate.K * 1e-39
-    found_there = search.invariant_polytope(search.feedback_of(replace(certificate, K=K)), tiny, lambda line: None)
+    found_there = next(
+        search.invariant_polytopes(search.feedback_of(replace(certificate, K=K)), tiny, lambda line: None)
+    )
     broken = [
         [c.name for c in judge(replace(certificate, K=K, polytope=found_there), tiny).conditions
          if not c.holds and c.name.startswith("(P")]
@@ -209,7 +211,7 @@ def test_errors_that_leave_a_face_alone_leave_no_polytope():
     certificate = certificate_of(plant)
     wide = replace(certificate, proofs=(replace(certificate.proofs[0], Sigma=1e4 * certificate.Sigma),))
     with pytest.raises(Infeasible):
-        search.invariant_polytope(search.feedback_of(wide), plant, lambda line: None)
+        next(search.invariant_polytopes(search.feedback_of(wide), plant, lambda line: None))
 
 
 def test_search_for_a_polytope_that_is_ended_leaves_the_ellipsoid():

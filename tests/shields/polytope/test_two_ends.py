@@ -14,6 +14,7 @@ from benchmarks.published import channel_of, contract_of_plant, plant_of, publis
 from ncs_gym import AdversarialDisturbance, ChannelContract, MovedOperatingPointWarning, contract_of
 from shields import CertificateError, Infeasible
 from shields.synthesis.invariant_polytope import feedback_of, points_of_box, share_of_points
+from shields.synthesis.tolerance import most_tolerated, tolerated_gains
 from tests.certificates import certificate_of, feasible_age_not_sought
 from tests.product import altered, linear_plant, sampled_plant, synthesize, vector_shield
 from tests.second_verifier.verify import verify_again
@@ -414,7 +415,16 @@ def test_state_that_only_follows_needs_no_limit():
     assert verified(synthesize(plant, contract=ChannelContract(1)), plant).valid
 
 
+def test_of_gains_that_bear_just_too_little_a_search_finds_one_that_bears_more():
+    crane, contract = plant_of("port_crane"), contract_of_plant("port_crane")
+    gains = sorted(each.margin for each in tolerated_gains(crane, contract))
+    assert gains[-2] < 0.993
+    assert gains[-1] > 1.0189
+
+
 @pytest.mark.slow
-def test_crane_that_bears_little_more_than_its_radii_has_a_polytope():
-    crane = plant_of("port_crane")
-    assert verified(synthesize(crane, contract=contract_of_plant("port_crane")), crane).valid
+@pytest.mark.parametrize("name", ["port_crane", "propofol"])
+def test_plant_that_bears_little_more_than_its_radii_has_a_polytope(name):
+    plant, contract = plant_of(name), contract_of_plant(name)
+    assert most_tolerated(plant, contract, polytope=True).margin < 1.02
+    assert verified(synthesize(plant, contract=contract), plant).valid

@@ -1,0 +1,298 @@
+"""What radii of disturbances and errors a gain bears, and which gain bears most."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from ncs_gym import ChannelContract, LinearPlant, exact
+from ncs_gym.plants.lqr import lqr_gain
+from shields.errors import Infeasible
+from shields.synthesis.design_problem import DesignProblem, Rest, design_problem
+from shields.synthesis.max_margin_gain import MaxMarginGain, max_margin_gain
+from shields.synthesis.resting_point import (
+    around,
+    at_operating_point,
+    disturbance_around,
+    equilibria,
+    farthest_equilibrium,
+    farthest_from_limits,
+    limit_rows,
+    limits_around,
+    needs_resting_point,
+)
+
+# Weights of the inputs, in units of their limits, against those of the states, in units of the box, in the
+# linear-quadratic regulators.
+_INPUT_WEIGHTS = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+# Disturbances and errors are summed over so many steps that what is left is smaller than this, next to the first ones.
+_LEFT_OVER = 1e-7
+# They are summed over at most so many steps, and so many numbers. A gain is too slow if more than this is left then.
+_MOST_STEPS, _MOST_NUMBERS, _MOST_LEFT = 20_000, 4_000_000, 1e-4
+# No limit counts as less needed than this, in units of half its range.
+_SMALLEST_NEED = 1e-3
+# The search for a more tolerant gain ends after so many iterations, or where one gains less than this.
+_ITERATIONS, _SMALLEST_GAIN = 60, 1e-6
+# Digits of a tolerated factor.
+_DIGITS = 9
+# What a gain that is too slow is said to lack of every limit.
+_TOO_SLOW = -1e3
+
+
+def regulators(plant: LinearPlant) -> list[np.ndarray]:
+    """Returns the gains, shape (m, n), of linear-quadratic regulators that use less and less of the inputs.
+
+    Limits of states and inputs together cost as inputs do.
+    """
+    state, pushed = plant.mixed_rows[:, : plant.n], plant.mixed_rows[:, plant.n :]
+    effort, crossed = np.diag(plant.input_half**-2.0) + pushed.T @ pushed, state.T @ pushed
+    found = (
+        lqr_gain(plant.A, plant.B, plant.weight + weight * state.T @ state, weight * effort, weight * crossed)
+        for weight in _INPUT_WEIGHTS
+    )
+    return [K for K in found if K is not None]
+
+
+class Tolerated(NamedTuple):
+    """A gain with the factor that all radii may grow by until it keeps no polytope within the limits.
+
+    Attributes:
+        K: The gain, shape (m, n).
+        rest: The resting point that suits it.
+        margin: The factor.
+        binding: The limits that are reached first, numbers of `limit_rows`.
+    """
+
+    K: np.ndarray
+    rest: Rest
+    margin: float
+    binding: tuple[int, ...] = ()
+
+
+class Tolerance:
+    """What radii a gain bears.
+
+    From rest errors and disturbances take a limited quantity c x at most as far as the sum of their supports, step by
+    step, by what the closed loop makes of the row c. Where that stays within all limits, the states that stay in them
+    for ever are a set around the resting point (Kolmanovsky and Gilbert 1998, docs/bibliography.md); elsewhere there is
+    none.
+    """
+
+    def __init__(self, plant: LinearPlant, errors: np.ndarray, D: np.ndarray, fixed: Rest | None = None) -> None:
+        """Begins with a plant.
+
+        Args:
+            plant: The plant.
+            errors: Shapes of the error sets, (l, n, n).
+            D: Shape of the disturbance set, (n, n).
+            fixed: The resting point; the one that suits each gain by default.
+        """
+        self._plant, self._fixed = plant, fixed
+        self._x, self._u = plant.half_widths, plant.input_half
+        self._A, self._B = plant.A * self._x / self._x[:, None], plant.B * self._u / self._x[:, None]
+        self._errors, self._D = errors / np.outer(self._x, self._x), D / np.outer(self._x, self._x)
+        self._limits = limit_rows(plant, D)
+        self._state, self._input = self._limits.rows[:, : plant.n] * self._x, self._limits.rows[:, plant.n :] * self._u
+
+    def of(self, K: np.ndarray) -> Tolerated | None:
+        """Returns what a gain, shape (m, n), bears; None if it is too slow to tell."""
+        needs = self.needs(K)
+        return None if needs is None else self._around(K, needs)
+
+    def needs(self, K: np.ndarray) -> np.ndarray | None:
+        """Returns how far errors and disturbances take every limit from rest, in units of half its range, shape (r,).
+
+        None for a gain that is too slow to tell.
+        """
+        found = self._needs_and_slopes(self._scaled(K))
+        return None if found is None else found[0]
+
+    def improved(self, K: np.ndarray, enough: float = np.inf) -> Tolerated | None:
+        """Returns the gain of the largest margin near a given one: sequential quadratic programming, with derivatives.
+
+        None if the given one is too slow. The margin s, its inverse being minimized, and the resting point x_c are
+        variables: what a gain needs, and x_c / s, stay within the limits times 1 / s.
+
+        Args:
+            K: The given one, shape (m, n).
+            enough: The search ends once the margin is as large.
+        """
+        best = self.of(K)
+        if best is None:
+            return None
+        shape, limits, fixed = K.shape, self._limits, self._fixed
+        largest = np.abs(self._scaled(K)).max(axis=0)  # of each state; so units and wide limits do not matter
+        sizes = np.where(largest > 0.0, largest, 1.0)
+        directions = np.empty((sum(shape), 0)) if fixed else equilibria(self._plant)
+        moved = limits.rows @ directions
+        ends = limits if fixed is None else around(limits, fixed)
+        above, below = np.isfinite(ends.high), np.isfinite(ends.low)
+        last: dict[bytes, tuple[np.ndarray, np.ndarray] | None] = {}
+
+        def lacks(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            k = K.size
+            if (key := z[:k].tobytes()) not in last:  # values and derivatives are asked for in turn
+                last.clear()
+                last[key] = self._needs_and_slopes(z[:k].reshape(shape) * sizes)
+            if (found := last[key]) is None:
+                return np.full(above.sum() + below.sum(), _TOO_SLOW), np.zeros((above.sum() + below.sum(), len(z)))
+            needs, slopes = found[0], (found[1] * sizes).reshape(len(moved), k)
+            reached = moved @ z[k:-1]
+            left = np.concatenate(
+                [(ends.high * z[-1] - reached - needs)[above], (reached - ends.low * z[-1] - needs)[below]]
+            )
+            by_limit = (
+                np.hstack([-slopes, -moved, ends.high[:, None]])[above],
+                np.hstack([-slopes, moved, -ends.low[:, None]])[below],
+            )
+            return left, np.concatenate(by_limit)
+
+        def stop(z: np.ndarray) -> None:
+            nonlocal best
+            tried = self.of(self._physical(z[: K.size].reshape(shape) * sizes))
+            if tried is not None and best is not None and tried.margin > best.margin:
+                best = tried
+            if best is not None and best.margin >= enough:
+                raise StopIteration
+
+        units = np.concatenate([self._x, self._u])
+        at = np.linalg.lstsq(directions / units[:, None], np.concatenate(best.rest) / units, rcond=None)[0]
+        slope = np.append(np.zeros(K.size + len(at)), 1.0)
+        minimize(
+            lambda z: z[-1],
+            np.concatenate([(self._scaled(K) / sizes).ravel(), at / best.margin, [1.0 / best.margin]]),
+            jac=lambda z: slope,
+            constraints={"type": "ineq", "fun": lambda z: lacks(z)[0], "jac": lambda z: lacks(z)[1]},
+            method="SLSQP",
+            callback=stop,
+            options={"maxiter": _ITERATIONS, "ftol": _SMALLEST_GAIN},
+        )
+        return best
+
+    def _around(self, K: np.ndarray, needs: np.ndarray) -> Tolerated | None:
+        if self._fixed is not None:
+            ends = around(self._limits, self._fixed)
+            shares = np.minimum(ends.high, -ends.low) / needs
+            margin = float(exact.rounded(float(shares.min()), _DIGITS))
+            return Tolerated(K, self._fixed, margin, tuple(np.flatnonzero(shares <= margin * (1.0 + 1e-6)).tolist()))
+        try:
+            farthest = farthest_equilibrium(self._plant, needs, self._limits)
+        except Infeasible:  # between samples nothing is left
+            return None
+        margin = float(exact.rounded(farthest.distance, _DIGITS))
+        return Tolerated(K, farthest.rest, margin, tuple(farthest.binding.tolist()))
+
+    def _scaled(self, K: np.ndarray) -> np.ndarray:
+        return K * self._x / self._u[:, None]
+
+    def _physical(self, K: np.ndarray) -> np.ndarray:
+        return K / self._x * self._u[:, None]
+
+    def _needs_and_slopes(self, K: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns the needs (r,) of a scaled gain and their derivatives, shape (r, m, n)."""
+        closed_loop, answer = self._A + self._B @ K, self._B @ K
+        first = self._state + self._input @ K
+        radius = float(np.abs(np.linalg.eigvals(closed_loop)).max()) if np.isfinite(closed_loop).all() else np.inf
+        most = min(_MOST_STEPS, _MOST_NUMBERS // first.size)
+        if radius >= 1.0 or most * np.log(max(radius, 1e-3)) > np.log(_MOST_LEFT):
+            return None
+        steps = min(most, int(np.log(_LEFT_OVER) / np.log(max(radius, 1e-3))) + len(K.T) + 1)
+        powers = np.eye(len(closed_loop))[None]
+        while len(powers) < steps:
+            powers = np.concatenate([powers, powers @ (powers[-1] @ closed_loop)])
+        rows = first @ powers[:steps]  # (steps, r, n): c (A + B K)^i
+        by_disturbance, to_disturbance = _support(rows, self._D[None])
+        by_errors, to_errors = _support(rows @ answer, self._errors)
+        at_once, to_input = _support(self._input @ K, self._errors)
+        needs = by_disturbance.sum(axis=0) + by_errors.sum(axis=0) + at_once + self._limits.disturbed
+        # The chain rule, backwards: what a row of one step adds to all later ones.
+        to_rows, later = to_disturbance + to_errors @ answer.T, np.zeros_like(first)
+        summed = np.empty_like(rows)
+        for i in range(steps - 1, -1, -1):
+            summed[i] = later = to_rows[i] + later @ closed_loop.T
+        by_loop = np.einsum("tri,trj->rij", rows[:-1], summed[1:])
+        by_answer = np.einsum("tri,trj->rij", rows, to_errors)
+        slopes = self._B.T @ (by_loop + by_answer) + self._input[:, :, None] * (summed[0] + to_input)[:, None, :]
+        return np.maximum(needs, _SMALLEST_NEED), slopes
+
+
+def _support(rows: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the largest support over ellipsoids, shape (l, n, n), of rows (..., n), and its derivatives (..., n)."""
+    best, slopes = np.zeros(rows.shape[:-1]), np.zeros_like(rows)
+    for shape in shapes:
+        image = rows @ shape
+        support = np.sqrt(np.maximum((image * rows).sum(axis=-1), 0.0))
+        larger = support > best
+        slopes = np.where(larger[..., None], image / np.where(larger, support, 1.0)[..., None], slopes)
+        best = np.where(larger, support, best)
+    return best, slopes
+
+
+def tolerated_gains(
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    fixed: Rest | None = None,
+    known: Sequence[np.ndarray] = (),
+    enough: float = np.inf,
+) -> list[Tolerated]:
+    """Returns gains with what they bear: given ones, that of the tolerant ellipsoid, the most tolerant, regulators.
+
+    Args:
+        plant: The plant.
+        contract: Channel contract; None for none.
+        fixed: The resting point; the one that suits each gain by default.
+        known: Gains, shape (m, n).
+        enough: No more tolerant one is sought where one bears so much.
+
+    Raises:
+        Infeasible: If the plant has no error set, or no resting point.
+    """
+    rest = fixed or farthest_from_limits(plant)
+    problem, errors = design_problem(plant, contract, limits_around(plant, rest))
+    tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest), fixed)
+    start = max_margin_gain(problem, problem.covering_error_shape)
+    gains = [*known, *([] if start is None else [problem.to_physical(start.L, start.K)[1]])]
+    first, others = ([found for K in each if (found := tolerance.of(K))] for each in (gains, regulators(plant)))
+    best = max([*first, *others], key=lambda each: each.margin, default=None)
+    if best is None or best.margin >= enough:
+        return [*first, *others]
+    return [*first, *filter(None, [tolerance.improved(best.K, enough)]), *others]
+
+
+def most_tolerated(
+    plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool, enough: float = np.inf
+) -> Tolerated | None:
+    """Returns the gain that bears the most of the radii, of a polytope or an ellipsoid; None if no gain stabilizes.
+
+    Args:
+        plant: The plant.
+        contract: Channel contract, if there is one.
+        polytope: Whether it is enough that it keeps a polytope.
+        enough: A factor beyond which no larger one is sought.
+
+    Raises:
+        Infeasible: If there is no error set, or no equilibrium within the limits.
+    """
+    fixed = None if needs_resting_point(plant) else at_operating_point(plant)
+    if polytope:
+        return max(tolerated_gains(plant, contract, fixed, (), enough), key=lambda each: each.margin, default=None)
+    problem, _ = design_problem(plant, contract)
+    gain = max_margin_gain(problem, problem.covering_error_shape)
+    return None if gain is None else of_ellipsoid(plant, problem, gain)
+
+
+def of_ellipsoid(plant: LinearPlant, problem: DesignProblem, gain: MaxMarginGain) -> Tolerated:
+    """Returns what a gain bears with an ellipsoid around the operating point.
+
+    Where the box counts between samples, which the search for the gain knows nothing of, a bound from above: at most
+    what the gain bears with a polytope, as far as that is known.
+    """
+    K, rest = problem.to_physical(gain.L, gain.K)[1], at_operating_point(plant)
+    T, errors = problem.transform, problem.error_shapes
+    found = Tolerance(plant, T @ errors @ T.T, plant.disturbance.shape_matrix, rest).of(K)
+    if found is None:
+        return Tolerated(K, rest, gain.margin)
+    return found._replace(margin=gain.margin if plant.grid_rows is None else min(gain.margin, found.margin))
