@@ -341,7 +341,9 @@ def _left(name: str, plant: LinearPlant, steps: int) -> float:
         before, u = info["constraint_values"], np.where(rng.random(u.shape) < 0.2, -u, u)
         *_, info = envs.step(u.astype(np.float32))
         inside = np.maximum(before, info["constraint_values"]).max(axis=1) <= 0.0
-        most = max(most, 1.0 + float(info["worst_constraint_values"][inside].max(initial=-1.0)))
+        most = max(
+            most, 1.0 + float(info.get("worst_constraint_values", info["constraint_values"])[inside].max(initial=-1.0))
+        )
     return most
 
 

@@ -40,15 +40,25 @@ def rows(text):
     return [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in "".join(tables).splitlines()]
 
 
-def kinds(mode):
-    """Shape or type of every key that an environment is said to have, behind a shield of a mode or without one.
+# Where an environment has a key that not all have.
+HAVING = {
+    "downlink": lambda env: env.downlink is not None,
+    "on request": lambda env: env.channel.on_request,
+    "more limits": lambda env: env.loop.limits_the_way,
+    "family": lambda env: env.plant.remainder is not None and env.plant.remainder.family is not None,
+}
 
-    None of these is that of a family, which alone has parameters.
-    """
+
+def kinds(mode, env=None):
+    """Shape or type of every key that an environment is said to have, behind a shield of a mode or without one."""
     authors = (NCSEnv,) if mode is None else (NCSEnv, SafetyShield)
     described = [row for author in authors for row in rows(inspect.getdoc(author))]
-    listed = {key.strip("`"): kind.strip("`") for key, kind, *_ in described}
-    missing = {"parameters"} | ({"shield_plan_length"} if mode != "lookahead" else set())
+    listed = {
+        key.strip("`"): kind.strip("`")
+        for key, kind, _, _, *where in described
+        if env is None or all(HAVING[each](env.unwrapped) for each in where)
+    }
+    missing = {"shield_plan_length"} if mode != "lookahead" else set()
     return {key: kind for key, kind in listed.items() if key not in missing}
 
 
@@ -80,7 +90,7 @@ def test_page_names_every_key_once():
     table = re.search(r"^\| about \| keys \|\n\|[-|]+\n((?:\|.*\n)+)", PAGE, re.MULTILINE)[1]
     named = re.findall(r"`(\w+)`", table)
     assert len(named) > 20
-    assert sorted(named) == sorted([*kinds("lookahead"), "parameters"])
+    assert sorted(named) == sorted(kinds("lookahead"))
 
 
 @pytest.mark.cases(5)
@@ -90,7 +100,7 @@ def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
     env, envs = gym.make(env_id), gym.make_vec(env_id, num_envs=NUMBER)
     if mode is not None:
         env, envs = safety_shield(env, certificate, mode), vector_shield(envs, certificate, mode)
-    expected = kinds(mode)
+    expected = kinds(mode, env)
     for info in infos(env, 4):
         assert set(info) == set(expected)
         for key, kind in expected.items():
@@ -108,7 +118,7 @@ def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
 def test_page_names_what_the_end_of_an_episode_adds():
     envs = gym.make_vec(ENVIRONMENTS[0], num_envs=NUMBER, max_episode_steps=2, autoreset_mode="SameStep")
     *_, last = infos(envs, 2)
-    added = set(last) - set(kinds(None))
+    added = set(last) - set(kinds(None, envs))
     assert "final_info" in added
     assert all(f"`{key}`" in PAGE for key in added)
 
@@ -120,7 +130,7 @@ def test_actions_of_infos_are_those_that_stand_for_the_inputs(loop):
     low, high = plant.input_ends
     for info in reported:
         for name in ("applied", "committed"):
-            inputs = info["input" if name == "applied" else "input_committed"]
+            inputs = info["input"] if name == "applied" else info.get("input_committed", info["input"])
             np.testing.assert_allclose(info[f"action_{name}"], (2.0 * inputs - low - high) / (high - low), atol=2e-7)
     overridden = [info for info in reported if np.any(info["shield_intervened"])]
     assert len(overridden) > 10

@@ -58,7 +58,7 @@ class DisturbanceObserver:
             d = np.where(begun[:, None], 0.0, self.disturbance)
             last = before + np.einsum("kij,kj->ki", lagged, d)
             now = estimates + np.einsum("kij,kj->ki", lags, d)
-            seen = now - last @ self._A.T - infos["input_committed"] @ self._B.T
+            seen = now - last @ self._A.T - infos.get("input_committed", infos["input"]) @ self._B.T
             d = d + np.where(begun[:, None], 0.0, self._alpha * (seen - d))
             self.disturbance = np.clip(d, -self._largest, self._largest)
         self._before = estimates.copy(), lags

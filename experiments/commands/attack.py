@@ -167,7 +167,7 @@ def attacked(shield: VectorSafetyShield, rng: np.random.Generator) -> Iterator[C
     for _ in range(EPISODE_STEPS):
         *_, info = shield.step(act(info["estimate"]))
         guaranteed = info["shield_guaranteed"]
-        kept &= ~(info["contract_broken"] | info["downlink_broken"])
+        kept &= ~(info["contract_broken"] | info.get("downlink_broken", False))
         where = {
             "steps": np.ones(count, np.bool_),
             "outside S": ~(certificate.safe_set.gauge(info["state"]) <= 1.0),

@@ -60,7 +60,8 @@ def bounds(settings: BoundsSettings) -> None:
     inputs, measured = _read(settings.file, [*plant.input_names], outputs)
     parts = plant.bounds.disturbance.parts
     E = np.hstack([each.E for each in parts]) if all(isinstance(each, Through) for each in parts) else None
-    noise = plant.bounds.sums(n, plant.p)[1].support(np.eye(plant.p)) if not settings.sensor else settings.sensor
+    own = plant.bounds.sums(n, plant.p)[1].sized(plant.p)
+    noise = settings.sensor or own.support(np.eye(plant.p))
     labels = {"states": dict.fromkeys(plant.state_names[:n]), "inputs": dict.fromkeys(plant.input_names)}
     found = bounds_from_recording(
         plant.model, inputs, measured, E, None if settings.estimate_sensor else noise, labels=labels

@@ -72,7 +72,8 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
     process. Truncation is that of the `TimeLimit` around, or that environment's own.
 
     ## Info (the same keys from reset and step, every array a fresh copy)
-    States and inputs are deviations from the plant's operating point, if it has one (`plant.from_deviation`).
+    States and inputs are deviations from the plant's operating point, if it has one (`plant.from_deviation`). Keys of
+    the second table are there where the environment has what stands with them.
 
     | key | shape or type | unit | meaning |
     |---|---|---|---|
@@ -81,12 +82,10 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
     | `estimation_error` | `(n,)` | of the states | x_hat - x now, also behind a downlink |
     | `error_shape` | `(n, n)` | of the states, squared | Sigma_k: the error of `estimate` lies in E(Sigma_k) |
     | `input` | `(m,)` | of the inputs | the input applied in this step; zeros at reset |
-    | `input_committed` | `(m,)` | of the inputs | the input decided in this step; without a downlink the one applied |
     | `action_applied` | `(m,)` | - | the action in [-1, 1] that stands for `input`, float32 |
-    | `action_committed` | `(m,)` | - | the action that stands for `input_committed`, which clones learn |
+    | `action_committed` | `(m,)` | - | likewise of what was decided in this step, which clones learn |
     | `constraint_values` | `(k,)` | - | how far c_j x is beyond a limit, in halves of its range; positive is violated |
-    | `worst_constraint_values` | `(k + q,)` | - | the largest since the last step, and those of limits of x and u |
-    | `cost` | float | - | 1.0 if one of them is positive: the true state violated the safe box, else 0.0 |
+    | `cost` | float | - | 1.0 if a limit was violated since the last step, else 0.0 |
     | `episode_steps` | int | steps | steps taken in this episode |
     | `measurement_age` | int | steps | age of the newest sample used; the first estimate counts as a sample of step 0 |
     | `packet_arrived` | bool | - | whether a packet arrived at this step |
@@ -94,15 +93,22 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
     | `episode_violations` | float | steps | sum of `cost` in this episode |
     | `is_success` | float | - | 1.0 while `episode_violations` is zero, else 0.0 |
     | `contract_broken` | bool | - | whether the newest sample used is older now than the channel's contract allows |
-    | `downlink_broken` | bool | - | whether zero was applied in this step because the input committed had not arrived |
-    | `requested` | bool | - | whether a sample was requested in this step; False where samples are not on request |
-    | `request_forced` | bool | - | whether that was so because the contract needs it though nobody asked |
     | `packets` | int | packets | samples sent in this episode |
     | `channel_loss` | float | - | long-run share of samples that this episode's channel loses (`Channel.mean_loss`) |
     | `channel_delay` | int | steps | longest delay of this episode's channel |
     | `downlink_loss` | float | - | likewise of its downlink; zero for an ideal one |
     | `downlink_delay` | int | steps | likewise |
-    | `parameters` | `(f,)` | of the parameters | those of the member that moves; of the plant of a family alone |
+
+    | key | shape or type | unit | meaning | where |
+    |---|---|---|---|---|
+    | `input_committed` | `(m,)` | of the inputs | the input decided in this step, for c steps later | downlink |
+    | `downlink_broken` | bool | - | whether zero was applied because the committed input had not arrived | downlink |
+    | `requested` | bool | - | whether a sample was requested in this step | on request |
+    | `request_forced` | bool | - | whether only the contract asked for it | on request |
+    | `worst_constraint_values` | `(k + q,)` | - | the largest since the last step, those of x and u too | more limits |
+    | `parameters` | `(f,)` | of the parameters | those of the member that moves | family |
+
+    "More limits" are limits at all times and limits of states and inputs together.
 
     Args:
         plant: The plant with its bounds.
@@ -366,7 +372,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
     def _info(self, inputs: Inputs, *, arrived: bool, read: Any = None) -> dict[str, Any]:
         report = self._now.report(inputs, arrived)
         self._belief = report.belief
-        return loop_info(report, self.loop.oldest, actions_of(inputs, self.plant, read))
+        return loop_info(report, self.loop, actions_of(inputs, self.plant, read))
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

@@ -107,6 +107,11 @@ class Loop:
         return arrival_histories(self.plant, channel, self.certificate_contract)
 
     @property
+    def limits_the_way(self) -> bool:
+        """Whether there are limits beyond those of states at samples: at all times, or of states and inputs."""
+        return self.plant.between_samples is not None or len(self.plant.mixed_rows) > 0
+
+    @property
     def oldest(self) -> float:
         """The largest age of the newest sample that the contract allows [steps]; infinite without one."""
         return largest_age(self.contract)
@@ -187,7 +192,6 @@ class LoopState(CopiedWhole, ABC):
         self.requests = None
         if loop.channel.on_request:
             self.requests = Requests(loop.channel, loop.contract, loop.protocol.input_delay, size)
-        self._worst_is_now = plant.between_samples is None and not len(plant.mixed_rows)
         self._others: dict[str, Any] = {}
 
     @property
@@ -234,7 +238,7 @@ class LoopState(CopiedWhole, ABC):
     def report(self, inputs: Inputs, arrived: Any, counted: np.ndarray | None = None) -> Report:
         """Returns what happened; the costs of loops that are not `counted`, shape (N,), do not count once more."""
         plant, estimator, worst = self.loop.plant, self.estimator, self.worst
-        values = worst if self._worst_is_now else plant.constraint_values(self.state)
+        values = plant.constraint_values(self.state) if self.loop.limits_the_way else worst
         estimate, number = estimator.numbered(self.pending)
         age, damaged, outside = estimator.age, estimator.damaged, self.process.alarm
         alarm, asked, forced = estimator.alarm | outside, False, False

@@ -293,4 +293,4 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
         report = self._now.report(inputs, arrived, counted)
         self._belief = report.belief
-        return loop_info(report, self.loop.oldest, actions_of(inputs, self.plant))
+        return loop_info(report, self.loop, actions_of(inputs, self.plant))

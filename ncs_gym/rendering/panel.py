@@ -37,7 +37,7 @@ def draw_panel(canvas: Canvas, episode: EpisodeRecord) -> None:
         _draw_input(canvas, episode, i, theme.PANEL.y + ROW * i)
     if (tracked := episode.tracked) is not None:
         _draw_tracked_output(canvas, tracked, theme.PANEL.y + ROW * inputs)
-    if episode.info["downlink_broken"]:
+    if episode.info.get("downlink_broken"):
         canvas.text("downlink broken: zero input", (theme.PANEL.x, 412), theme.DANGER, bold=True)
     _draw_legend(canvas, episode.annotation)
 
@@ -95,7 +95,9 @@ def _draw_input(canvas: Canvas, episode: EpisodeRecord, index: int, y: float) ->
     color = theme.SHIELD if episode.intervened else theme.STEEL
     text = theme.value_label(value + float(plant.operating_input[index]), limit, plant.input_units[index])
     proposed = None if note is None or not note.intervened else note.proposed
-    arrow = [] if proposed is None else [proposed[index], info["input_committed"][index]]
+    arrow = (
+        [] if proposed is None else [proposed[index], episode.info.get("input_committed", episode.info["input"])[index]]
+    )
     place, ends, values = (theme.PANEL.x, y), plant.input_ends[:, index], [0.0, value, *arrow]
     bar, arrow = draw_bar(canvas, place, plant.input_names[index], text, (color, color), ends, values)
     if not arrow:

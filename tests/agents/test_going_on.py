@@ -139,7 +139,7 @@ def test_replay_buffers_hold_what_was_applied_if_asked_to(loop, algorithm):
             self.applied = []
 
         def _on_step(self):
-            self.applied += self.training_env.unwrapped.batch_info["input_committed"].tolist()
+            self.applied += self.training_env.unwrapped.batch_info["input"].tolist()
             return True
 
     keeping, limit = Keeping(), truck_trailer().u_max

@@ -56,7 +56,6 @@ from ncs_gym.envs.env import RenderModeError, ncs_env
 from ncs_gym.model import zero_order_hold
 from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
 from ncs_gym.uncertainty.disturbances import as_disturbance, checked
-from shields import SafetyShield
 from tests.product import altered, linear_plant
 
 TRUCK, POLE, LINEAR = "ncs_gym/TruckTrailer-v0", "ncs_gym/CartPole-v0", "ncs_gym/LinearNCS-v0"
@@ -264,7 +263,6 @@ REQUESTS = [
     lambda: RequestActions(gym.make("CartPole-v1")),
     lambda: RequestActions(gym.make(POLE, **ASKED), -1.0),
     lambda: VectorRequestActions(gym.make_vec(POLE, num_envs=2, autoreset_mode="SameStep", **ASKED)),
-    lambda: SafetyShield(RequestActions(gym.make(POLE, **ASKED))),
     lambda: RequestActions(gym.make(POLE, **ASKED)).step(np.array([0.0, np.nan])),
     lambda: RequestActions(gym.make(POLE, **ASKED)).step(np.zeros(1)),
 ]

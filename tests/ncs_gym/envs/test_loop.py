@@ -25,7 +25,7 @@ def decisions(env, steps=80):
     env.reset(seed=4)
     for _ in range(steps):
         *_, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32))
-        found.append([np.copy(info[key]) for key in ("input_committed", "shield_intervened", "shield_guaranteed")])
+        found.append([np.copy(info[key]) for key in ("action_committed", "shield_intervened", "shield_guaranteed")])
     return found
 
 

@@ -261,7 +261,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
         goes_on = env.episodes == episodes
         watch.step(column(info["state"]), column(info["input"]), held, ages, info["shield_reason"], goes_on)
         broken = ["contract_broken", "downlink_broken", *([] if case.process else ["assumption_violated"])]
-        outcome.lost |= {key for key in broken if np.any(info[key])}
+        outcome.lost |= {key for key in broken if np.any(info.get(key, False))}
         planned = np.asarray(info.get("shield_plan_length", 0))
         counts["overridden"] += np.count_nonzero(info["shield_intervened"])
         counts["planned"] += np.count_nonzero(planned)

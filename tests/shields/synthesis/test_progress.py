@@ -7,7 +7,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from experiments.settings import SynthesizeSettings
+from experiments.commands.synthesize import SynthesizeSettings
 from shields import Certificate
 from shields.errors import SynthesisInterrupted
 from tests.plants import random_plant
