@@ -1,4 +1,4 @@
-"""`ncs bounds`: half-widths of disturbances and sensor noise that a record of a plant proves."""
+"""`ncs bounds`: half-widths of disturbances that a record of a plant proves."""
 
 from __future__ import annotations
 
@@ -27,11 +27,9 @@ def bounds(settings: BoundsSettings) -> None:
     inputs, measured = _read(settings.file, [*plant.input_names], outputs)
     parts = plant.bounds.disturbance.parts
     E = np.hstack([each.E for each in parts]) if all(isinstance(each, Through) for each in parts) else None
-    noise = plant.bounds.sized(n, plant.p).sensor.support(np.eye(plant.p)) if not settings.sensor else settings.sensor
+    sensor = settings.sensor or plant.bounds.sensor.sized(plant.p).support(np.eye(plant.p))
     labels = {"states": dict.fromkeys(plant.state_names[:n]), "inputs": dict.fromkeys(plant.input_names)}
-    found = bounds_from_recording(
-        plant.model, inputs, measured, E, None if settings.estimate_sensor else noise, labels=labels
-    )
+    found = bounds_from_recording(plant.model, inputs, measured, E, sensor=sensor, labels=labels)
     print(found)
     if settings.out is not None:
         document = {"plant": plant.fingerprint} | found.document

@@ -267,7 +267,6 @@ class BoundsSettings:
         plant: File of the plant (`LinearPlant.save`), in place of an environment's. Its disturbance says along which
             directions to seek: E of Through(E, ...), else every state.
         sensor: Half-widths of the noise of each output, as of a data sheet; by default the plant's own.
-        estimate_sensor: Seek them in the record, too.
         out: File for the numbers (JSON).
         seed: Not used, since nothing is drawn; every command takes it.
     """
@@ -276,7 +275,6 @@ class BoundsSettings:
     env: str | None = None
     plant: Path | None = None
     sensor: tuple[float, ...] = ()
-    estimate_sensor: bool = False
     out: Path | None = None
     seed: int = 0
 
@@ -284,8 +282,6 @@ class BoundsSettings:
         _refuse_both(self.env, self.plant)
         if self.env is None and self.plant is None:
             raise ValueError("give the plant of the record: --plant FILE or --env ID")
-        if self.sensor and self.estimate_sensor:
-            raise ValueError("give either --sensor or --estimate-sensor, not both")
 
 
 @dataclass(frozen=True, kw_only=True)

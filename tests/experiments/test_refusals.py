@@ -95,7 +95,6 @@ USAGE = [
     ("requirements --ages 1 1", "ages must be different values"),
     ("bounds r.csv --env ncs_gym/CartPole-v0 --plant x.json", "either --env or --plant"),
     ("bounds r.csv", "give the plant of the record: --plant FILE or --env ID"),
-    ("bounds r.csv --plant x.json --sensor 1 --estimate-sensor", "either --sensor or --estimate-sensor"),
     ("reproduce --starts 0", "--starts must be"),
     ("reproduce --steps -1", "--steps must be"),
     ("reproduce --seed -1", "--seed must be"),
