@@ -49,7 +49,7 @@ class Growth(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RecordedBounds(ReadOnlyArrays):
-    """Half-widths of a disturbance E s, direction by direction, and of sensor noise, from a recording.
+    """Half-widths of a disturbance E s, direction by direction, from a recording.
 
     Attributes:
         E: Directions, shape (n, q).
@@ -61,8 +61,7 @@ class RecordedBounds(ReadOnlyArrays):
             (q,): at least this sum occurred.
         upper: No larger disturbance occurred, shape (q,); infinite where the outputs do not tell. With a window of
             several steps this takes for granted that none was larger closer to an end of the record than that.
-        sensor: Half-widths of the sensor noise that `lower` and `upper` take for granted, shape (p,).
-        is_sensor_known: Whether they were given; otherwise they are a part of what `explaining` explains.
+        sensor: Half-widths of the sensor noise that all these take for granted, shape (p,).
         left: Share of the second half's steps whose disturbance may exceed all of the first half's, shape (q,).
         longest: The longest run of such steps, shape (q,).
         grows: Where disturbances grow with a state or an input: the model is wrong, not the bound.
@@ -79,7 +78,6 @@ class RecordedBounds(ReadOnlyArrays):
     explaining: np.ndarray
     upper: np.ndarray
     sensor: np.ndarray
-    is_sensor_known: bool
     left: np.ndarray
     longest: np.ndarray
     grows: tuple[Growth, ...]
@@ -89,9 +87,7 @@ class RecordedBounds(ReadOnlyArrays):
         self._make_arrays_read_only()
 
     def bounds(self, factor: float, *, of: str = "upper", first_error: Any = None) -> Bounds:
-        """Returns bounds of a plant: half-widths found here, times a factor that you declare.
-
-        Sensor noise that was given stays as it is; what was estimated is multiplied, too.
+        """Returns bounds of a plant: half-widths found here, times a factor that you declare; sensor noise as it was.
 
         Args:
             factor: At least 1.
@@ -111,14 +107,13 @@ class RecordedBounds(ReadOnlyArrays):
                 f"these outputs leave no upper bound of {name}: measure more, give fewer directions, or declare a "
                 'multiple of what explains the record, of="explaining"'
             )
-        grown = 1.0 if self.is_sensor_known else factor
         if first_error is None:
             if not np.isfinite(self.first_error).all():
                 raise ValueError("one sample of these outputs does not tell the state: give first_error")
-            first_error = grown * self.first_error
+            first_error = self.first_error
         is_identity = np.array_equal(self.E, np.eye(len(self.E)))
         disturbance = Box(-half, half) if is_identity else Through(self.E, half)
-        return Bounds(disturbance, grown * self.sensor, first_error)
+        return Bounds(disturbance, self.sensor, first_error)
 
     @property
     def document(self) -> dict[str, Any]:
@@ -130,12 +125,11 @@ class RecordedBounds(ReadOnlyArrays):
         return values | {"grows": [each._asdict() for each in self.grows]}
 
     def __str__(self) -> str:
-        known = "" if self.is_sensor_known else ", which explain the record, too"
         noise = ", ".join(f"{name} {half:.3g}" for name, half in zip(self.outputs, self.sensor, strict=True))
         width = max(9, *map(len, self.directions))
         lines = [
             fill(f"Half-widths of the disturbance of a step, of {counted(self.steps, 'step')}, if sensor noise was "
-                 f"within {noise}{known}.", 80),
+                 f"within {noise}.", 80),
             f"{'direction':<{width}}  at least  explaining   at most  left [%]  in a row",
         ]  # fmt: skip
         for i, name in enumerate(self.directions):
@@ -170,8 +164,8 @@ def bounds_from_recording(
     inputs: Any,
     outputs: Any,
     E: Any = None,
-    sensor: Any = None,
     *,
+    sensor: Any,
     weights: Any = None,
     labels: Mapping[str, Any] | None = None,
 ) -> RecordedBounds:
@@ -187,9 +181,9 @@ def bounds_from_recording(
         inputs: Of each step, shape (N, m), in the model's own units as the outputs; they act after its delays.
         outputs: Sampled before the input, shape (N + 1, p), or (N, p), where the last input is not used.
         E: Directions of the disturbance, shape (n, q); the identity if None.
-        sensor: Half-widths of sensor noise, a number or shape (p,), as of a data sheet; None to have them estimated.
-        weights: Of the half-widths in `explaining`, shape (q,), or (q + p,) if those of sensors are sought, too; by
-            default the inverse of what each would be if it explained the record alone.
+        sensor: Half-widths of sensor noise, a number or shape (p,), as of a data sheet.
+        weights: Of the half-widths in `explaining`, shape (q,); by default the inverse of what each would be if it
+            explained the record alone.
         labels: Names of states and inputs for people, as of `LinearPlant`.
 
     Raises:
@@ -206,16 +200,15 @@ def bounds_from_recording(
     is_identity, E = E is None, np.eye(n) if E is None else as_matrix(E, (n, None), "E")
     if not np.abs(E).max(axis=0).all():
         raise ValueError("every direction of E must move a state, one is zero")
-    known = None if sensor is None else as_setting(sensor)
-    if sensor is not None and (known is None or known.shape not in ((), (p,)) or not (known >= 0.0).all()):
+    known = as_setting(sensor)
+    if known is None or known.shape not in ((), (p,)) or not (known >= 0.0).all():
         raise ValueError(f"sensor must be half-widths, a number or shape ({p},), got {shown(sensor)}")
     names = {"states": [f"x{i + 1}" for i in range(n)], "inputs": [f"u{i + 1}" for i in range(m)]}
     for each, default in names.items():
         names[each] = [*as_names([*(labels or {}).get(each, ())], tuple(default), f"names of {each}")]
     record = _Record(model, E, u, y)
-    phi = None if known is None else np.broadcast_to(known, p).copy()
-    explaining, estimated = record.explaining(phi, weights)
-    phi = estimated if phi is None else phi
+    phi = np.broadcast_to(known, p).copy()
+    explaining = record.explaining(phi, weights)
     upper, found, noise = record.upper(phi)
     lower = np.minimum(record.lower(phi), upper)
     half = len(found) // 2
@@ -234,7 +227,6 @@ def bounds_from_recording(
         explaining=explaining,
         upper=upper,
         sensor=phi,
-        is_sensor_known=known is not None,
         left=may_leave.mean(axis=0),
         longest=np.array([_longest_run(each) for each in may_leave.T]),
         grows=tuple(
@@ -308,16 +300,13 @@ class _Record:
             seen.append(self.y[j + 1 : j + 1 + count] - moved @ self.model.H.T)
         return np.hstack(seen)
 
-    def explaining(self, phi: np.ndarray | None, weights: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the half-widths of the smallest weighted sum, of the directions and of sensors (empty beside phi)."""
-        units = self.s_unit if phi is not None else np.concatenate([self.s_unit, self.y_unit])
+    def explaining(self, phi: np.ndarray, weights: Any) -> np.ndarray:
+        """Returns the half-widths of the smallest weighted sum, shape (q,)."""
+        units = self.s_unit
         cost = 1.0 / units if weights is None else as_setting(weights)
         if cost is None or cost.shape != units.shape or not ((cost > 0.0) & (cost < np.inf)).all():
             raise ValueError(f"weights must be positive, shape {units.shape}, got {shown(weights)}")
-        q, cost = len(self.s_unit), cost * units
-        found = units * self._least([*range(q)], cost / cost.max(), phi)
-        # The solver's tolerance may not make sensors too good for any explanation.
-        return found[:q], found[q:] + _PRECISION * units[q:]
+        return units * self._least([*range(len(units))], cost * units / (cost * units).max(), phi)
 
     def lower(self, phi: np.ndarray) -> np.ndarray:
         """Returns the smallest half-width of each direction alone, the others free, shape (q,)."""
@@ -328,10 +317,8 @@ class _Record:
         ]
         return self.s_unit * np.maximum(np.array(least) - _PRECISION, 0.0)
 
-    def _least(
-        self, kept: list[int], cost: np.ndarray, phi: np.ndarray | None, part: slice = slice(None)
-    ) -> np.ndarray:
-        """Returns the half-widths, in units, of the directions that are kept, and of sensors unless they are given.
+    def _least(self, kept: list[int], cost: np.ndarray, phi: np.ndarray, part: slice = slice(None)) -> np.ndarray:
+        """Returns the half-widths, in units, of the directions that are kept.
 
         The variables, in units, are v of each sample, s of each step, and the half-widths. The first nu samples of the
         part tell a state, if what is `beside` vanishes, and every further one is what the nu before it predict.
@@ -351,24 +338,22 @@ class _Record:
             of_noise = _shifted(np.split(seen, nu + 1, axis=1), times, N + 1)
             equal.append(hstack([of_noise, _shifted(np.split(seen @ through, nu, axis=1), times, N)]))
             told.append((data[:times] @ seen.T).ravel())
-        equal, told, size, free = vstack(equal), np.concatenate(told), (N + 1) * p + N * q, len(kept) + p
-        some, half = kron(eye_array(N), csr_array(np.eye(q)[kept])), kron(np.ones((N, 1)), eye_array(len(kept)))
-        noise, loud = eye_array((N + 1) * p), kron(np.ones((N + 1, 1)), eye_array(p))
-        within = [[None, some, -half, None], [None, -some, -half, None]]
-        within += [[noise, None, None, -loud], [-noise, None, None, -loud]]
-        ends = [(0.0, None)] * p if phi is None else [(each, each) for each in phi / self.y_unit]
+        told, noises, count = np.concatenate(told), (N + 1) * p, len(kept)
+        none = csr_array((N * count, noises))
+        some, half = kron(eye_array(N), csr_array(np.eye(q)[kept])), kron(np.ones((N, 1)), eye_array(count))
+        loudest = [(-each, each) for each in np.tile(phi / self.y_unit, N + 1).tolist()]
         program = {
-            "c": np.concatenate([np.zeros(size), cost, np.zeros(free - len(cost))]),
-            "A_ub": block_array(within, format="csr"),
-            "b_ub": np.zeros(2 * (N * len(kept) + (N + 1) * p)),
-            "A_eq": hstack([equal, csr_array((len(told), free))], format="csr"),
+            "c": np.concatenate([np.zeros(noises + N * q), cost]),
+            "A_ub": block_array([[none, some, -half], [none, -some, -half]], format="csr"),
+            "b_ub": np.zeros(2 * N * count),
+            "A_eq": hstack([vstack(equal), csr_array((len(told), count))], format="csr"),
             "b_eq": told,
-            "bounds": [(None, None)] * size + [(0.0, None)] * len(kept) + ends,
+            "bounds": loudest + [(None, None)] * (N * q) + [(0.0, None)] * count,
         }
         for method in ("highs-ipm", "highs-ds"):
             found: Any = linprog(**program, method=method)
             if found.status == 0:
-                return found.x[size : size + len(cost)]
+                return found.x[-count:]
             if found.status == 2:
                 raise ValueError(
                     "no disturbance along E and no sensor noise within its half-widths explain the record: give more "

@@ -114,7 +114,7 @@ VALUES = [
     Through(np.eye(2), np.ones(2)),
     Sum((Box(np.zeros(2), np.ones(2)), Ball(1.0))),
     Loop(plant=truck_trailer()),
-    bounds_from_recording(pendulum().model, np.zeros((20, 1)), np.zeros((21, 2)), np.ones((2, 1)), 0.1),
+    bounds_from_recording(pendulum().model, np.zeros((20, 1)), np.zeros((21, 2)), np.ones((2, 1)), sensor=0.1),
 ]
 PASSING = {Annotation}  # made anew for every frame
 

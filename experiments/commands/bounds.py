@@ -1,4 +1,4 @@
-"""`ncs bounds`: half-widths of disturbances and sensor noise that a record of a plant proves."""
+"""`ncs bounds`: half-widths of disturbances that a record of a plant proves."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ class BoundsSettings:
         plant: File of the plant (`LinearPlant.save`), in place of an environment's. Its disturbance says along which
             directions to seek: E of Through(E, ...), else every state.
         sensor: Half-widths of the noise of each output, as of a data sheet; by default the plant's own.
-        estimate_sensor: Seek them in the record, too.
         out: File for the numbers (JSON).
     """
 
@@ -40,15 +39,12 @@ class BoundsSettings:
     env: str | None = None
     plant: Path | None = None
     sensor: tuple[float, ...] = ()
-    estimate_sensor: bool = False
     out: Path | None = None
 
     def __post_init__(self) -> None:
         require_one_plant(self)
         if self.env is None and self.plant is None:
             raise ValueError("give the plant of the record: --plant FILE or --env ID")
-        if self.sensor and self.estimate_sensor:
-            raise ValueError("give either --sensor or --estimate-sensor, not both")
 
 
 def bounds(settings: BoundsSettings) -> None:
@@ -60,12 +56,9 @@ def bounds(settings: BoundsSettings) -> None:
     inputs, measured = _read(settings.file, [*plant.input_names], outputs)
     parts = plant.bounds.disturbance.parts
     E = np.hstack([each.E for each in parts]) if all(isinstance(each, Through) for each in parts) else None
-    own = plant.bounds.sums(n, plant.p)[1].sized(plant.p)
-    noise = settings.sensor or own.support(np.eye(plant.p))
+    sensor = settings.sensor or plant.bounds.sensor.sized(plant.p).support(np.eye(plant.p))
     labels = {"states": dict.fromkeys(plant.state_names[:n]), "inputs": dict.fromkeys(plant.input_names)}
-    found = bounds_from_recording(
-        plant.model, inputs, measured, E, None if settings.estimate_sensor else noise, labels=labels
-    )
+    found = bounds_from_recording(plant.model, inputs, measured, E, sensor=sensor, labels=labels)
     print(found)
     if settings.out is not None:
         document = {"plant": plant.fingerprint} | found.document

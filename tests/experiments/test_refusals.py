@@ -88,7 +88,6 @@ USAGE = [
     ("requirements --ages 1 1", "ages must be different values"),
     ("bounds r.csv --env ncs_gym/CartPole-v0 --plant x.json", "either --env or --plant"),
     ("bounds r.csv", "give the plant of the record: --plant FILE or --env ID"),
-    ("bounds r.csv --plant x.json --sensor 1 --estimate-sensor", "either --sensor or --estimate-sensor"),
     ("sweep --losses 0.1 0.1", "--losses must be different"),
     ("sweep --delays 1 1", "--delays must be different"),
     ("sweep --arms shielded shielded", "--arms must be different values"),

@@ -57,7 +57,7 @@ def case_of(name):
 def test_what_acted_lies_between_the_bounds_within_a_factor_of_two_where_states_are_measured(name):
     model, E, half, phi = case_of(name)
     u, y, s = driven(model, 400, half, phi, E=E)
-    found, acted = bounds_from_recording(model, u, y, E, phi), np.abs(s).max(axis=0)
+    found, acted = bounds_from_recording(model, u, y, E, sensor=phi), np.abs(s).max(axis=0)
     assert (0.5 * acted <= found.lower).all()
     assert (found.lower <= acted).all()
     assert (acted <= found.upper).all()
@@ -83,28 +83,6 @@ def test_bounds_are_those_of_a_dense_program_and_of_the_corners_of_the_noise():
     assert found.upper == pytest.approx(np.max(largest, axis=0), rel=1e-5)
 
 
-MOTOR = Model.sampled([[0, 1, 0], [-20, -2, 10], [0, -1, -20]], [[0], [0], [20]], [[1, 0, 0], [0, 0, 1]], 0.02)
-HELD = np.array([[0.005], [0.1]])
-
-
-@pytest.mark.parametrize(
-    ("model", "E"),
-    [(servo(), None), (servo(), HELD), (servo([[1, 0], [0, 1], [1, 1]]), HELD), (MOTOR, MOTOR.B), (MOTOR, None)],
-)
-def test_sensors_are_weighed_too_where_nothing_is_known_of_them_as_in_a_dense_program(model, E):
-    q, p = 1 if E is not None else len(model.A), len(model.H)
-    w = np.arange(1.0, 1.0 + q + p)
-    u, y, _ = driven(model, 40, np.full(q, 0.02), 0.002, E=E)
-    found = bounds_from_recording(model, u, y, E, weights=w)
-    theta, noise, told = oracle(model, u, y, E)
-    phi = cp.max(cp.abs(noise), axis=0)
-    least = cp.Problem(cp.Minimize(w[:q] @ theta + w[q:] @ phi), told).solve()
-    assert w @ [*found.explaining, *found.sensor] == pytest.approx(least, rel=1e-3)
-    assert not found.is_sensor_known
-    bounds = found.bounds(1.5, of="explaining", first_error=1)
-    assert bounds.sensor.half == pytest.approx(1.5 * found.sensor)
-
-
 def oracle(model, u, y, E=None):
     """Half-widths, noise, and the equations of a record, for cvxpy: by states, with every variable there is."""
     E = np.eye(len(model.A)) if E is None else np.array(E)
@@ -116,7 +94,7 @@ def oracle(model, u, y, E=None):
 def test_outputs_alone_bound_disturbances_along_few_directions():
     model = library_plant(ncs_gym.batch_reactor).model
     u, y, s = driven(model, 300, np.array([0.01, 0.02]), 1e-5, E=model.B)
-    found = bounds_from_recording(model, u, y, model.B, 1e-5)
+    found = bounds_from_recording(model, u, y, model.B, sensor=1e-5)
     inner = np.abs(s[found.window : -found.window]).max(axis=0)
     assert found.window > 1
     assert (0.5 * inner <= found.lower).all()
@@ -187,15 +165,15 @@ def test_records_are_in_the_units_of_the_model_and_inputs_act_after_its_delays()
 def test_last_input_is_left_out_where_no_output_follows_it():
     u, y, _ = driven(servo(), 60, 0.01, 1e-4)
     E = [[0.0], [1.0]]
-    whole = bounds_from_recording(servo(), u[:-1], y[:-1], E, 1e-4)
-    assert bounds_from_recording(servo(), u, y[:-1], E, 1e-4).lower == pytest.approx(whole.lower)
+    whole = bounds_from_recording(servo(), u[:-1], y[:-1], E, sensor=1e-4)
+    assert bounds_from_recording(servo(), u, y[:-1], E, sensor=1e-4).lower == pytest.approx(whole.lower)
 
 
 def test_bounds_of_a_factor_make_a_plant():
     model = servo(np.eye(2))
     E, labels = np.array([[0.005], [0.1]]), {"states": {"angle": "rad", "rate": ""}, "inputs": {"volts": "V"}}
     u, y, _ = driven(model, 100, 0.01, 1e-3, E=E)
-    found = bounds_from_recording(model, u, y, E, 1e-3, labels=labels)
+    found = bounds_from_recording(model, u, y, E, sensor=1e-3, labels=labels)
     bounds = found.bounds(1.5)
     assert bounds.disturbance.set.half == pytest.approx(1.5 * found.upper)
     assert bounds.sensor.half == pytest.approx([1e-3, 1e-3])
@@ -227,6 +205,7 @@ U, Y = np.zeros((30, 1)), np.random.default_rng(0).uniform(-1e-3, 1e-3, (31, 2))
         ({"E": [[1.0, 0.0], [0.0, 0.0]]}, "every direction of E must move a state, one is zero"),
         ({"sensor": -1.0}, r"sensor must be half-widths, a number or shape \(2,\), got -1.0"),
         ({"sensor": [np.nan, 1.0]}, "sensor must be half-widths"),
+        ({"sensor": None}, "sensor must be half-widths"),
         ({"weights": [1.0]}, r"weights must be positive, shape \(2,\), got \[1.0\]"),
         ({"E": [[1.0], [0.0]], "sensor": 0.0}, "no disturbance along E and no sensor noise within its half-widths"),
         ({"labels": {"states": {"angle": "rad"}}}, "names of states must have 2 entries"),
