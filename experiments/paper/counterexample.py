@@ -44,7 +44,7 @@ class Ball:
         return self.squared_radius**0.5 * outwards / length if length > 0.0 else np.zeros_like(slope)
 
     def contains(self, point: np.ndarray) -> bool:
-        """Returns whether a point, shape (n,), lies inside, in exact arithmetic; rounding beside a line is not looked at."""
+        """Returns whether a point, shape (n,), lies inside, in exact arithmetic; rounding off a line is allowed."""
         return _squared(point) <= Fraction(self.squared_radius)
 
     def exact_shape(self, n: int) -> Matrix:

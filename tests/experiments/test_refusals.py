@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.baselines.requests import best_period
+from benchmarks.requests import best_period
 from experiments.commands.attack import AttackSettings
 from experiments.commands.channel import ChannelSettings
 from experiments.commands.compare import CompareSettings
