@@ -22,10 +22,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents import SB3VecEnv
 from agents.evaluation import Policy
 from benchmarks.commands import run, some_of, table
-from benchmarks.timing import timed
-from experiments.baselines import EstimateFilterSettings, tuned_weights
-from experiments.baselines.controllers import REGULATORS, controller
-from experiments.baselines.requests import (
+from benchmarks.requests import (
     Asking,
     RequestsOnly,
     acknowledged,
@@ -36,6 +33,9 @@ from experiments.baselines.requests import (
     slack,
     with_rule,
 )
+from benchmarks.timing import timed
+from experiments.baselines import EstimateFilterSettings, tuned_weights
+from experiments.baselines.controllers import REGULATORS, controller
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
 from experiments.terminal import text_table
 from ncs_gym import (

@@ -20,7 +20,6 @@ from experiments.paper.counterexample import (
     Box,
     OneStep,
     OnlyIfExample,
-    Segment,
     contracts,
     stays_inside,
     worst_step,
@@ -227,7 +226,7 @@ def invariance(example: PaperExample) -> Claim:
 def reachable_invariance(example: PaperExample) -> Claim:
     """Returns the row about Definition 3 with the errors that can occur."""
     closed_loop, M, ball = example.closed_loop, example.M, Ball(example.plant.gamma)
-    reachable = Segment(example.B[:, 0], example.epsilon)
+    reachable = Ball(example.epsilon, along=example.B[:, 0])
     level = worst_step(closed_loop, M, ball, reachable).level
     stays = stays_inside(closed_loop, M, ball, reachable)
     return Claim(

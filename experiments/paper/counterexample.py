@@ -30,49 +30,28 @@ _DECIMALS = 4
 _STARTS, _ASCENT_STEPS = 200, 200
 
 
-@dataclass(frozen=True)
-class Ball:
-    """{z : z'z <= squared_radius}, the set Delta(squared_radius) of (3)."""
-
-    squared_radius: float
-
-    def extreme_point(self, slope: np.ndarray) -> np.ndarray:
-        """Returns the point farthest along a slope, shape (n,)."""
-        length = np.linalg.norm(slope)
-        return self.squared_radius**0.5 * slope / length if length > 0.0 else np.zeros_like(slope)
-
-    def contains(self, point: np.ndarray) -> bool:
-        """Returns whether a point, shape (n,), lies inside, in exact arithmetic."""
-        return _squared(point) <= Fraction(self.squared_radius)
-
-    def exact_shape(self, n: int) -> Matrix:
-        """Returns P with {z : a'z <= sqrt(a'Pa) for all a} the set, as rational numbers."""
-        return scale(Fraction(self.squared_radius), rational(np.eye(n)))
-
-
 @dataclass(frozen=True, eq=False)
-class Segment:
-    """{t vector : t^2 vector'vector <= squared_radius}, for a vector of shape (n,)."""
+class Ball:
+    """{z : z'z <= squared_radius}, the set Delta(squared_radius) of (3), or its diameter along a vector, shape (n,)."""
 
-    vector: np.ndarray
     squared_radius: float
+    along: np.ndarray | None = None
 
     def extreme_point(self, slope: np.ndarray) -> np.ndarray:
         """Returns the point farthest along a slope, shape (n,)."""
-        end = (self.squared_radius / (self.vector @ self.vector)) ** 0.5 * self.vector
-        return end if end @ slope >= 0.0 else -end
+        outwards = slope if self.along is None else self.along * (1.0 if self.along @ slope >= 0.0 else -1.0)
+        length = np.linalg.norm(outwards)
+        return self.squared_radius**0.5 * outwards / length if length > 0.0 else np.zeros_like(slope)
 
     def contains(self, point: np.ndarray) -> bool:
-        """Returns whether a point, shape (n,), lies within the ends of the segment, in exact arithmetic.
-
-        The rounding of a point next to the line is not looked at.
-        """
+        """Returns whether a point, shape (n,), lies inside, in exact arithmetic; rounding off a line is allowed."""
         return _squared(point) <= Fraction(self.squared_radius)
 
     def exact_shape(self, n: int) -> Matrix:
         """Returns P with {z : a'z <= sqrt(a'Pa) for all a} the set, as rational numbers."""
-        factor = Fraction(self.squared_radius) / _squared(self.vector)
-        entries = [Fraction(float(entry)) for entry in self.vector]
+        if self.along is None:
+            return scale(Fraction(self.squared_radius), rational(np.eye(n)))
+        factor, entries = Fraction(self.squared_radius) / _squared(self.along), rational(self.along)[0]
         return [[factor * left * right for right in entries] for left in entries]
 
 
@@ -113,7 +92,7 @@ class OneStep:
 
 
 def worst_step(
-    closed: np.ndarray, M: np.ndarray, disturbances: Ball | Box, errors: Ball | Segment, *, starts: int = _STARTS
+    closed: np.ndarray, M: np.ndarray, disturbances: Ball | Box, errors: Ball, *, starts: int = _STARTS
 ) -> OneStep:
     """Returns the step from {x'Mx <= 1} that ends at the largest x+'M x+.
 
@@ -152,7 +131,7 @@ def worst_step(
     return OneStep(x, d, e, closed @ x + d + e, level, is_confirmed((x, d, e)))
 
 
-def stays_inside(closed: np.ndarray, M: np.ndarray, disturbances: Ball, errors: Ball | Segment) -> bool:
+def stays_inside(closed: np.ndarray, M: np.ndarray, disturbances: Ball, errors: Ball) -> bool:
     """Returns whether exact arithmetic proves that no such step leaves the set (False: not proved).
 
     With P the closed loop's image of M^-1 and the shapes of e and d, any weights that sum to 1 give an ellipsoid around

@@ -1,1 +1,1 @@
-"""Figures of comparisons and sweeps, and animations of episodes."""
+"""Figures of comparisons and sweeps."""

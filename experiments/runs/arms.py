@@ -228,8 +228,6 @@ def run_of_arm(
                 loop.vector(1).close()
             except ValueError as error:
                 raise ValueError(f"arm {arm.name}: {error}") from None
-    origin = f"synthesized for plant {certificate.fingerprint} under {certificate.contract}"
-    origin += "" if certificate.polytope is None else " with a polytope"
     return TrainingRun(
         arm=arm.name,
         policy_kind=arm.policy,
@@ -241,7 +239,6 @@ def run_of_arm(
         steps=settings.training_steps,
         episodes=settings.episodes,
         certificate=certificate,
-        certificate_basis=origin if settings.certificate is None else "",
         scenarios=other_scenarios(getattr(settings, "scenarios", ())),
         algorithm=settings.algo,
         settings=hyperparams,

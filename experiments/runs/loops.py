@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +41,6 @@ def registered_env(env_id: str) -> NCSEnv:
         if name not in gym.registry:
             raise ValueError(f"module {module!r} registers no environment {name!r}")
     elif name not in registered_ids() and name not in needing_extras():
-        known = {each.lower(): each for each in registered_ids()}
-        whole = f"ncs_gym/{name.lower().removeprefix('ncs_gym/')}"
-        for meant in (f"{whole}-v0", whole):
-            if near := get_close_matches(meant, known, 1, 0.95):
-                raise ValueError(f"unknown environment {env_id!r}; did you mean {known[near[0]]!r}?")
         if name in gym.registry:
             raise ValueError(
                 f"{env_id} has no plant of its own: register_plant makes an id of yours (--env module:id), some "

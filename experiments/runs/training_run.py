@@ -97,8 +97,6 @@ class TrainingRun:
         steps: Training steps.
         episodes: Evaluation episodes.
         certificate: Certificate of shield or filter, which also defines x'Mx and the gain of controllers.
-        certificate_basis: What the certificate was synthesized from, in words; empty for one that was given. Its last
-            digits may depend on the machine, and a run that another machine finished is still the same run.
         scenarios: Scenarios that the policy is evaluated under besides that of its training.
         algorithm: Name of the learning algorithm, one of `agents.hyperparams.ALGORITHMS`.
         settings: Hyperparameters of the learning algorithm.
@@ -118,7 +116,6 @@ class TrainingRun:
     steps: int
     episodes: int
     certificate: Certificate
-    certificate_basis: str = ""
     scenarios: tuple[str, ...] = ()
     algorithm: str
     settings: dict[str, Any]
@@ -165,9 +162,9 @@ class TrainingRun:
     @property
     def key(self) -> str:
         """SHA-256 of all that the result depends on: settings, environment, source, versions of packages."""
-        others = {"certificate", "certificate_basis", "grid_point", "module", "went_on_after"}
+        others = {"certificate", "grid_point", "module", "went_on_after"}
         names = set(self.__dataclass_fields__) - others
-        certificate = self.certificate_basis or self.certificate.checksum
+        certificate = self.certificate.checksum
         content = {name: getattr(self, name) for name in names}
         content |= {
             "module": module_digest(self.module),

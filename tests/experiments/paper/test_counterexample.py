@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from experiments.paper.audit import invariance
-from experiments.paper.counterexample import Ball, Box, Segment, stays_inside, worst_step
+from experiments.paper.counterexample import Ball, Box, stays_inside, worst_step
 from experiments.paper.paper_example import PaperExample
 
 CASE = PaperExample()
@@ -69,13 +69,13 @@ def test_worst_step_beats_random_search(disturbances):
 
 
 def test_proof_of_invariance_stands_where_no_step_leaves_and_falls_where_one_does():
-    reachable = Segment(CASE.B[:, 0], CASE.epsilon)
+    reachable = Ball(CASE.epsilon, along=CASE.B[:, 0])
     assert stays_inside(CASE.closed_loop, CASE.M, Ball(5e-4), reachable)
     assert not stays_inside(CASE.closed_loop, CASE.M, Ball(5e-4), Ball(CASE.epsilon))
-    assert not stays_inside(CASE.closed_loop, CASE.M, Ball(5e-4), Segment(CASE.B[:, 0], 4.0 * CASE.epsilon))
+    assert not stays_inside(CASE.closed_loop, CASE.M, Ball(5e-4), Ball(4.0 * CASE.epsilon, along=CASE.B[:, 0]))
 
 
-@pytest.mark.parametrize("each", [Ball(0.04), Segment(np.array([3.0, 4.0]), 0.04), Box(np.array([0.1, 0.2]))])
+@pytest.mark.parametrize("each", [Ball(0.04), Ball(0.04, along=np.array([3.0, 4.0])), Box(np.array([0.1, 0.2]))])
 def test_extreme_points_are_farthest_and_inside(each):
     rng = np.random.default_rng(0)
     for slope in rng.standard_normal((20, 2)):
@@ -87,7 +87,7 @@ def test_extreme_points_are_farthest_and_inside(each):
 
 
 def test_exact_shapes_have_the_support_of_their_sets():
-    for each in (Ball(0.04), Segment(np.array([3.0, 4.0]), 0.04)):
+    for each in (Ball(0.04), Ball(0.04, along=np.array([3.0, 4.0]))):
         shape = np.array(each.exact_shape(2), dtype=float)
         for slope in np.random.default_rng(0).standard_normal((10, 2)):
             assert slope @ shape @ slope == pytest.approx((each.extreme_point(slope) @ slope) ** 2)

@@ -39,9 +39,7 @@ def test_stored_result_comes_back_exactly(folder, run, result):
         assert (len(path.inputs), path.intervened.sum()) == (episode.steps, episode.interventions)
 
 
-@pytest.mark.parametrize(
-    "change", [{"seed": 1}, {"steps": 257}, {"settings": {}}, {"certificate_basis": "another plant"}]
-)
+@pytest.mark.parametrize("change", [{"seed": 1}, {"steps": 257}, {"settings": {}}])
 def test_result_of_other_settings_is_not_taken(folder, run, change):
     assert load(folder, replace(run, **change)) is None
 

@@ -132,6 +132,8 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         for value in (np.nan, np.inf)
     ],
     # Environments.
+    (lambda: LoopConfig(env="ncs_gym/CartPol-v0"), ValueError, "is no registered environment"),
+    (lambda: LoopConfig(env="CSTR-v0"), ValueError, "is no registered environment"),
     (lambda: LoopConfig(env="ncs_gym/Nothing-v0"), ValueError, "'ncs_gym/Nothing-v0' is no registered environment"),
     # Filters.
     (lambda: SafetyFilter(replace(CERTIFICATE, L=1.1 * CERTIFICATE.L), PLANT), CertificateError, r"\(S\)"),

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from experiments.baselines.requests import (
+from benchmarks.requests import (
     Asking,
     RequestsOnly,
     acknowledged,
