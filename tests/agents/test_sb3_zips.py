@@ -59,6 +59,12 @@ def test_agent_acts_as_the_model_did_by_its_statistics_or_without_any(cls, tmp_p
     assert_acts_as(load_sb3_zip(file, CRUISE, cls.__name__, None), model, OBSERVATIONS)
 
 
+def test_statistics_of_rewards_alone_leave_observations_as_they_are(tmp_path):
+    model, _ = saved_with_statistics(tmp_path, norm_obs=False)
+    agent = load_sb3_zip(tmp_path / "own.zip", CRUISE, "PPO", tmp_path / "vecnormalize.pkl")
+    assert_acts_as(agent, model, OBSERVATIONS)
+
+
 class OwnPolicy(ActorCriticPolicy):
     pass
 

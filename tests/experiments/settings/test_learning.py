@@ -40,6 +40,14 @@ def test_steps_are_a_hyperparameter_too():
             CompareSettings(hyperparams={"n_timesteps": steps}).training_steps  # noqa: B018
 
 
+def test_what_is_given_wins_over_the_tuned_value_also_if_it_equals_the_default():
+    default, tuned = DEFAULTS["PPO"]["gamma"], tuned_hyperparams(CART_POLE)
+    assert tuned["gamma"] != default
+    settings = parse(["compare", "--env", CART_POLE, "--hyperparams", f"gamma={default}"])
+    assert settings.all_hyperparams == tuned | {"gamma": default}
+    assert f"tuned for {CART_POLE}, as given gamma: " in settings.agent_line
+
+
 def test_what_is_given_wins_over_the_tuned_values():
     given = ["n_timesteps=5000", "gamma=0.7", "n_steps=8", 'policy_kwargs={"net_arch": [8]}']
     settings = parse(["train", "--env", CART_POLE, "--hyperparams", *given])

@@ -15,6 +15,7 @@ from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.network_requirements import share_of
 from tests import plants
 from tests.product import altered, linear_plant, resampled, synthesize
+from tests.shields.polytope.limits import certificate as limited
 
 
 def servo(**changes):
@@ -134,3 +135,9 @@ def test_shares_for_limits_with_two_ends_are_nearly_those_that_synthesis_keeps()
     for age in found.ages:
         kept = synthesize(plant, contract=ChannelContract(age)).provenance["polytope_share_of_box"]
         assert share_of(found.certificate(age))[1] == pytest.approx(kept, abs=0.02)
+
+
+def test_share_is_that_of_what_shields_keep_and_of_open_boxes_none():
+    kept = limited("angle")
+    assert share_of(kept) == ("polytope", kept.provenance["polytope_share_of_box"])
+    assert share_of(replace(kept, provenance={})) == ("certificate", 1.0)
