@@ -26,6 +26,7 @@ from benchmarks.study import (
     quotable,
     switched,
 )
+from benchmarks.study_figures import study_figures
 from experiments.analysis.episodes import episodes_table
 from experiments.analysis.statistics import clopper_pearson
 from experiments.commands.compare import CompareSettings
@@ -155,6 +156,12 @@ def test_tables_have_every_arm_and_no_negative_zero(made):
         assert not re.search(r"(?<![\d.])-0(\.0+)?(?![\d.])", text)
         assert max(map(len, text.splitlines())) <= 80
     assert quotable(json.loads(json.dumps(made[0]))) == quotable(made[0])
+
+
+def test_figures_show_every_arm_and_every_run(made):
+    figures = study_figures(made[0])
+    assert figures.keys() == {"return", "runs", "training"}
+    assert all(png.startswith(b"\x89PNG") for png in figures.values())
 
 
 @pytest.mark.parametrize("env_id", [*ENVS, "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/CartPole-v0"])

@@ -24,16 +24,6 @@ def test_hyperparameters_tuned_for_the_environment_are_used(kind, env_id):
     assert f"PPO, hyperparameters tuned for {own_id}: n_envs=" in settings.agent_line
 
 
-@pytest.mark.parametrize(
-    ("env_id", "algo"),
-    [("plants:Plants/Tanks-v0", algo) for algo in DEFAULTS] + [(CART_POLE, algo) for algo in ("TRPO", "A2C", "TD3")],
-)
-def test_plant_of_ones_own_and_algorithm_that_was_not_tuned_get_the_defaults(env_id, algo):
-    settings = CompareSettings(env=env_id, algo=algo)
-    assert settings.all_hyperparams == DEFAULTS[algo]
-    assert f"{algo}, default hyperparameters: n_envs=" in settings.agent_line
-
-
 def test_steps_are_those_given_or_tuned_or_the_default():
     assert tuned_steps(CART_POLE) == CompareSettings(env=CART_POLE).training_steps == 600_000
     assert CompareSettings(env=CART_POLE, steps=150_000).training_steps == 150_000
@@ -50,6 +40,14 @@ def test_steps_are_a_hyperparameter_too():
     for steps in (0, 1.5, True, "many", 1e16):
         with pytest.raises(ValueError, match="n_timesteps must be a whole number >= 1, got"):
             CompareSettings(hyperparams={"n_timesteps": steps}).training_steps  # noqa: B018
+
+
+def test_what_is_given_wins_over_the_tuned_value_also_if_it_equals_the_default():
+    default, tuned = DEFAULTS["PPO"]["gamma"], tuned_hyperparams(CART_POLE)
+    assert tuned["gamma"] != default
+    settings = parse(["compare", "--env", CART_POLE, "--hyperparams", f"gamma={default}"])
+    assert settings.all_hyperparams == tuned | {"gamma": default}
+    assert f"tuned for {CART_POLE}, as given gamma: " in settings.agent_line
 
 
 def test_what_is_given_wins_over_the_tuned_values():

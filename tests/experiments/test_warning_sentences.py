@@ -21,23 +21,15 @@ def lines_of(text):
     return [line for line in re.split(r"[\r\n]", text) if line.strip()]
 
 
-def assert_said_once_for_each_delay(run):
+@pytest.mark.slow
+def test_warning_of_worker_processes_is_a_sentence_that_is_said_once_for_each_delay(tmp_path):
+    run = ncs(*SWEEP, "--jobs", 2, "--out", tmp_path)
     assert run.returncode == 0, run.stderr
     said = [line for line in lines_of(run.stderr) if "is likely to be lost" in line]
     starts = [f"ncs: warning: the channel lets the newest sample become {age} steps old" for age in (8, 9)]
     assert [line.partition(",")[0] for line in sorted(said)] == starts
     assert "Warning" not in run.stderr
     assert ".py" not in run.stderr
-
-
-@pytest.mark.slow
-def test_warning_of_a_sweep_is_one_sentence_on_its_own_line(tmp_path, without_workers):
-    assert_said_once_for_each_delay(ncs(*SWEEP, "--out", tmp_path))
-
-
-@pytest.mark.slow
-def test_warning_of_worker_processes_is_said_once(tmp_path):
-    assert_said_once_for_each_delay(ncs(*SWEEP, "--jobs", 2, "--out", tmp_path))
 
 
 def test_progress_bar_is_cleared_before_a_sentence(capsys):

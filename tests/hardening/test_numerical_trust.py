@@ -18,16 +18,6 @@ SIZES = [
 ]
 
 
-@pytest.mark.cases(1)
-@pytest.mark.parametrize(
-    ("n", "m", "seed", "radius"),
-    [(1, 1, 0, 0.99), (2, 1, 1, 0.9999), *(pytest.param(*size, marks=pytest.mark.slow) for size in SIZES)],
-)
-def test_units_do_not_decide_whether_there_is_a_certificate(n, m, seed, radius):
-    found = [outcome(badly_scaled_plant(seed, n, m, decades, radius)) for decades in (0, 6)]
-    assert found == ["certificate", "certificate"]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.99, 0.999, 0.9999])
 @pytest.mark.parametrize(("n", "m"), [(2, 2), (4, 1), (6, 3), (8, 2), (10, 3)])

@@ -107,11 +107,6 @@ def test_estimators_whose_graph_forgets_histories_do_not_drift(loaded, forgotten
 
 
 @pytest.mark.slow
-def test_long_runs_of_estimators_do_not_drift(loaded):
-    run_estimators(loaded, 64, 40)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 256])
 def test_a_million_steps_with_forgetting_do_not_grow(size, loaded, forgotten, monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 4000)

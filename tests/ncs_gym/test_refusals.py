@@ -110,14 +110,14 @@ def kinked_late():
 
     def step(state, u):
         calls.append(0)
-        return swing(state, u) + (1e-3 if len(calls) > 2_000 else 0.0)
+        return swing(state, u) + (1e-3 if len(calls) > 500 else 0.0)
 
     return step
 
 
 def modeled(process=swing, state=(0.25, 1.5), **settings):
     limits, nothing = Limits(list(state), TORQUE), Bounds(0.0, 0.0, 0.0)
-    return linear_model(process, limits, nothing, STEP, **{"samples": 2_000} | settings)
+    return linear_model(process, limits, nothing, STEP, **{"samples": 500} | settings)
 
 
 class Inner(gym.Env):

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from ncs_gym import (
-    Ball,
     Bounds,
     Box,
     Gaussian,
@@ -64,18 +63,6 @@ def test_past_inputs_are_known_since_delays_and_rates_made_them():
     assert LinearPlant(MODEL, Limits([1.0, 2.0], 1.0), BOUNDS).past == 0
 
 
-def test_gaussian_noise_counts_own_states_alone():
-    noise = Gaussian(1e-4 * np.eye(2), 0.05)
-    plain, late = (LinearPlant(model, LIMITS, Bounds(noise, noise, noise)) for model in (MODEL, MODEL.with_delays(3)))
-    for name in ("process_noise", "initial_noise"):
-        one, other = getattr(plain, name), getattr(late, name)
-        assert one.energy == other.energy
-        np.testing.assert_array_equal(other.bound.shape_matrix[:2, :2], one.bound.shape_matrix)
-        samples = other.sample(np.random.default_rng(0), 2000)
-        np.testing.assert_array_equal(samples[:, :2], one.sample(np.random.default_rng(0), 2000))
-        assert not samples[:, 2:].any()
-
-
 @pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
 @pytest.mark.parametrize("seed", [3, 10, 18])
 def test_what_the_point_lacks_of_rest_is_inside_where_large_pushes_cancel(seed):
@@ -113,14 +100,6 @@ def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
         each[0] = 0.5
     assert replace(plant, model=replace(model)).fingerprint == plant.fingerprint
     assert LinearPlant.load(json.loads(json.dumps(plant.document))).fingerprint == plant.fingerprint
-
-
-def test_sets_of_a_plant_hold_the_sum_of_all_that_is_declared():
-    both = Box([-0.01, -0.02], [0.01, 0.02]) + Ball(0.005) + Gaussian(1e-6 * np.eye(2), 0.05)
-    plant = LinearPlant(MODEL, LIMITS, Bounds(both, both, both))
-    directions = np.random.default_rng(0).standard_normal((100, 2))
-    for around in (plant.disturbance, plant.sensor_error, plant.initial_error):
-        assert (around.support(directions) >= both.sized(2).support(directions)).all()
 
 
 @pytest.mark.parametrize(

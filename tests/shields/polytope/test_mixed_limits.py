@@ -17,7 +17,6 @@ from tests.product import (
     altered,
     gym_env,
     gym_vector_env,
-    linear_plant,
     safe_loop,
     safety_shield,
     sampled_plant,
@@ -32,7 +31,6 @@ from tests.shields.polytope.limits import (
     ONE_INPUT,
     PLANTS,
     QUIET,
-    TWO_INPUTS,
     certificate,
     mixed_values,
 )
@@ -179,16 +177,6 @@ def test_file_and_fingerprint_hold_the_limits(tmp_path):
     open_end = altered(without, mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -np.inf, 0.2)])
     open_end.save(tmp_path / "plant.json")
     assert LinearPlant.load(tmp_path / "plant.json").mixed_ends[0].tolist() == [-np.inf]
-
-
-def test_limits_move_with_the_operating_point():
-    """The same limits and the same model, told from another point, hold for the same inputs and states."""
-    plant, there = PLANTS["coupled"], {"operating_state": [5.0, 3.0], "operating_input": [4.0, 2.0]}
-    other = linear_plant(mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -1.0, 0.2)], **TWO_INPUTS | there)
-    state, u = np.array([5.5, 4.5]), np.array([5.0, 2.9])
-    values = [each.mixed_values(each.to_deviation(state), each.to_deviation(u, "input")) for each in (plant, other)]
-    np.testing.assert_allclose(*values)
-    assert values[0] == pytest.approx([(2.9 - 2.5 - 0.2) / 0.6])
 
 
 def test_plant_with_such_limits_has_none_that_are_only_symmetric():

@@ -15,6 +15,7 @@ from shields.synthesis.certification import carried_over, nearby_certificate
 from shields.synthesis.network_requirements import share_of
 from tests import plants
 from tests.product import altered, linear_plant, synthesize
+from tests.shields.polytope.limits import certificate as limited
 
 
 def servo(**changes):
@@ -114,22 +115,15 @@ def test_certificate_of_a_looser_problem_is_not_carried_over_to_a_tighter_one():
 
 
 @pytest.mark.slow
-def test_limits_with_two_ends_have_shares_of_polytopes_and_open_boxes_none():
-    model = {"A": [[1.0, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 0.1, "input_limits": (-1.0, 2.0)}
-    model |= {"disturbance_bound": [0.02, 0.04], "sensor_bound": 0.01, "initial_bound": 0.01}
-    closed = linear_plant(state_limits=([-1.0, -1.0], [2.0, 1.5]), **model)
-    free = linear_plant(state_limits=([-1.0, -np.inf], [2.0, np.inf]), **model)
-    for plant, kind in ((closed, "polytope"), (free, "certificate")):
-        (certificate,), _ = requirements(plant, ages=[0, 1]).certificates
-        assert certificate is not None
-        assert share_of(certificate) == (kind, certificate.provenance.get("polytope_share_of_box", 1.0))
-        assert 0.5 < share_of(certificate)[1] <= 1.0
-
-
-@pytest.mark.slow
 def test_shares_for_limits_with_two_ends_are_nearly_those_that_synthesis_keeps():
     plant = plants.servo(1.0, box=None, state_limits=([-0.1, -4.0], [0.3, 4.0]))
     found = requirements(plant, ages=[0, 4])
     for age in found.ages:
         kept = synthesize(plant, contract=ChannelContract(age)).provenance["polytope_share_of_box"]
         assert share_of(found.certificate(age))[1] == pytest.approx(kept, abs=0.02)
+
+
+def test_share_is_that_of_what_shields_keep_and_of_open_boxes_none():
+    kept = limited("angle")
+    assert share_of(kept) == ("polytope", kept.provenance["polytope_share_of_box"])
+    assert share_of(replace(kept, provenance={})) == ("certificate", 1.0)
