@@ -281,8 +281,8 @@ _HEADERS = {
     IDEAL: ("ideal", "chan."),
     AS_TRAINED: ("as", "trained"),
     "worse channel": ("worse", "chan."),
-    ATTACKED: ("at-", "tacked"),
-    ATTACKED_IDEAL: ("att.,", "ideal"),
+    ATTACKED: ("under", "attack"),
+    ATTACKED_IDEAL: ("same,", "ideal"),
 }
 
 
@@ -291,8 +291,8 @@ def evaluation_table(env: dict[str, Any]) -> str:
     known = next(iter(env["arms"].values()))["scenarios"]
     scenarios = [name for name in _HEADERS if name in known]
     rows = [
-        ["violating [%]", *(_HEADERS[name][0] for name in scenarios), "at-", "over-", "return"],
-        ["", *(_HEADERS[name][1] for name in scenarios), "[95 % CI]", "ridden", "as trained"],
+        ["violating [%]", *(_HEADERS[name][0] for name in scenarios), "attack", "filter", "return"],
+        ["", *(_HEADERS[name][1] for name in scenarios), "[95 % CI]", "acts", "as trained"],
     ]
     for name, arm in env["arms"].items():
         rates = [f"{100 * arm['scenarios'][each]['rate']:.1f}" for each in scenarios]

@@ -160,7 +160,7 @@ def test_tables_have_every_arm_and_no_negative_zero(made):
 
 def test_figures_show_every_arm_and_every_run(made):
     figures = study_figures(made[0])
-    assert figures.keys() == {"return", "runs", "training"}
+    assert figures.keys() == {"violations", "return", "training"}
     assert all(png.startswith(b"\x89PNG") for png in figures.values())
 
 

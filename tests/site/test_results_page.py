@@ -22,6 +22,6 @@ def test_quoted_tables_are_those_of_the_stored_study(page, stored):
 
 def test_all_tables_and_figures_stand_beside_the_page(stored):
     assert all_tables(stored) == (ROOT / NUMBERS).with_suffix(".txt").read_text()
-    for name in ("return", "runs", "training"):
+    for name in ("violations", "return", "training"):
         assert f"images/results-{name}.png" in (ROOT / "docs" / "experiments.md").read_text()
         assert (ROOT / "docs" / "images" / f"results-{name}.png").is_file()
