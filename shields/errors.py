@@ -38,7 +38,7 @@ class Infeasible(ValueError):
     Attributes:
         binding: Name of the condition that cannot be met: "E1" (there is no error bound), "S" (the safe box is
             unbounded), "U" (the input limits), "I" (invariance) or "P" (a gain bears all, but its polytope was not
-            found), or "T" (`time_limit` was over before anything was found); where a candidate failed in exact
+            found), "R" (it has too many rows), or "T" (`time_limit` was over before anything was found); where a candidate failed in exact
             verification only, the condition it failed. For method "paper": "C2", "C1", "C5" (the input limit), or
             "grid" if OP is feasible but not at a point of the search grid.
         shortfall: By how much the condition fails: for "E1" the excess of the spectral radius over 1; for "I" and "U"

@@ -18,7 +18,6 @@ from shields.reach import reach_in
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
 from shields.synthesis.multipliers import with_best_multipliers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
-from shields.synthesis.share_of_box import share_of_box
 
 # Significant digits of the numbers of a certificate: what differs between processors beyond them is cut off. Sizes
 # that are for people have fewer.
@@ -95,18 +94,38 @@ def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, 
         L: Shape of the set, (n, n).
         volume: Volume of the set in units of the largest ellipsoid in the safe box.
     """
-    sizes = {"volume_of_box_ellipsoid": volume} | share_of_box(plant, L)
-    sizes = {name: size for name, size in sizes.items() if not (isinstance(size, float) and math.isnan(size))}
-    description: dict[str, Any] = {
-        name: float(exact.rounded(size, _SHOWN_DIGITS)) if isinstance(size, float) else size
-        for name, size in sizes.items()
-    }
-    if not {"share_of_box", "share_of_box_at_rest"} & sizes.keys():
-        description |= reach_recorded(Ellipsoid(L), plant)
-    assumptions = getattr(plant, "assumptions", ())
-    if assumptions:
-        description["assumptions"] = [assumptions] if isinstance(assumptions, str) else list(assumptions)
+    share = share_of_box(plant, L)
+    sizes = ({} if math.isnan(volume) else {"volume_of_box_ellipsoid": volume}) | share
+    description: dict[str, Any] = {name: float(exact.rounded(size, _SHOWN_DIGITS)) for name, size in sizes.items()}
+    description |= {} if share else reach_recorded(Ellipsoid(L), plant)
+    if plant.assumptions:
+        description["assumptions"] = list(plant.assumptions)
     return description
+
+
+def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, float]:
+    """Returns the record of the share of the safe box's volume that E(L) fills: pi/4 of a plane's at most.
+
+    Where the last states are inputs under way (`Model.with_delays`) the box is that of the others, and what counts is
+    which of its states are in E(L) with no input under way.
+
+    Args:
+        plant: The plant, with its safe box.
+        L: Shape of a set in the box, (n, n).
+
+    Returns:
+        One entry, `share_of_box` or `share_of_box_at_rest`, a number in (0, 1]; none of flat sets, and of boxes that
+        are open or have more rows than states.
+    """
+    kept = plant.n - plant.past
+    C = plant.box[plant.box[:, :kept].any(axis=1)] if plant.past else plant.box
+    is_box = len(C) == kept and not C[:, kept:].any() and np.isfinite(plant.box_ends).all()
+    if not is_box or exact.rank(C[:, :kept]) < kept or not np.linalg.slogdet(L)[0] > 0.0:
+        return {}
+    L = np.linalg.inv(np.linalg.inv(L)[:kept, :kept]) if plant.past else L
+    sides = abs(float(np.linalg.det(C[:, :kept] @ np.linalg.cholesky(L))))  # in units of the cube's [-1, 1]^n
+    share = math.pi ** (kept / 2) / math.gamma(kept / 2 + 1) / (2.0**kept / sides)
+    return {"share_of_box_at_rest" if plant.past else "share_of_box": share}
 
 
 def reach_recorded(safe_set: Ellipsoid | Polytope, plant: LinearPlant) -> dict[str, Any]:

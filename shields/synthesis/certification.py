@@ -10,9 +10,10 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.validation import as_number, as_vector, shown
 from shields.certificate import Certificate
 from shields.errors import Infeasible
+from shields.synthesis.alternating_optimization import ALTERNATIONS
 from shields.synthesis.design_problem import Rest
 from shields.synthesis.diagnosis import infeasibility, with_age_that_helps
-from shields.synthesis.ellipsoid_certificates import FoundEllipsoid, certify, largest_ellipsoid, with_tolerated_scale
+from shields.synthesis.ellipsoid_certificates import certify, largest_ellipsoid, with_tolerated_scale
 from shields.synthesis.polytope_certificates import (
     around_resting_point,
     certify_polytope,
@@ -82,7 +83,19 @@ def synthesize(
         rest = None if resting_state is None else resting_at(plant, as_vector(resting_state, plant.n, "resting_state"))
     search = Search(progress, time_limit)
     try:
-        return _found(plant, contract, search, rest, polytope=polytope)
+        found = _found(plant, contract, search, rest, polytope=polytope)
+        if isinstance(found, Certificate):
+            search.candidate = lambda: found
+            return with_polytope(found, plant, search) if polytope else found
+        search.refusal = found
+        if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
+            given = "this is around the resting_state that was given, without one the synthesis chooses"
+            raise Infeasible(f"{found}; {given}", found.binding, found.shortfall)
+
+        def certifies(promised: ChannelContract) -> bool:
+            return nearby_certificate(plant, promised, polytope=polytope, progress=search) is not None
+
+        raise with_age_that_helps(found, plant, contract, certifies, search, polytope=polytope)
     except TimeoutError:
         return search.best_in_time(plant)
     except KeyboardInterrupt as interrupt:
@@ -90,51 +103,39 @@ def synthesize(
 
 
 def _found(
-    plant: LinearPlant, contract: ChannelContract | None, search: Search, rest: Rest | None, *, polytope: bool
-) -> Certificate:
-    """Returns what `synthesize` does, around a given resting point or None.
+    plant: LinearPlant,
+    contract: ChannelContract | None,
+    search: Search,
+    rest: Rest | None = None,
+    start: Certificate | None = None,
+    alternations: int = ALTERNATIONS,
+    *,
+    polytope: bool,
+) -> Certificate | Infeasible:
+    """Returns a verified certificate, of an ellipsoid if one is found, else of a polytope alone, or why there is none.
 
     Raises:
         TimeoutError, KeyboardInterrupt: Where the search is ended; it holds what was reached.
     """
-    ellipsoid: FoundEllipsoid | None = None
     try:
-        fixed, known = rest, None
-        if rest is None and not needs_resting_point(plant):
-            ellipsoid = largest_ellipsoid(plant, contract, search)
-            if ellipsoid.certificate is not None:
-                found = with_tolerated_scale(ellipsoid.certificate, plant, ellipsoid.problem)
-                search.candidate = lambda: found
-                return with_polytope(found, plant, search) if polytope else found
-            search.candidate, fixed = None, at_operating_point(plant)
-            known = [] if ellipsoid.K is None else [ellipsoid.K]
-        if polytope:
-            alone = around_resting_point(plant, contract, search, fixed, known)
-            if (certificate := alone.certificate) is not None:
-                return with_tolerated_scale(certificate, plant, ellipsoid.problem) if ellipsoid else certificate
-            tolerated, reason = alone.tolerated, alone.reason
-        else:
-            tolerated, reason = most_tolerated(plant, contract, polytope=False), ""
-        refusal = ellipsoid.failure if ellipsoid else None
-        refusal = refusal or infeasibility(plant, tolerated, polytope=polytope, reason=reason)
+        if rest is not None or needs_resting_point(plant):
+            alone = around_resting_point(plant, contract, search, rest)
+            return alone.certificate or infeasibility(plant, alone.tolerated, polytope=True, reason=alone.reason)
+        ellipsoid = largest_ellipsoid(plant, contract, search, start, alternations)
+        found, known = ellipsoid.certificate, [] if ellipsoid.K is None else [ellipsoid.K]
+        tolerated, reason = None, ""
+        if found is None:
+            search.candidate = None
+            if polytope:
+                alone = around_resting_point(plant, contract, search, at_operating_point(plant), known)
+                found, tolerated, reason = alone
+            elif ellipsoid.failure is None:
+                tolerated = most_tolerated(plant, contract, polytope=False)
+        if found is not None:
+            return with_tolerated_scale(found, plant, ellipsoid.problem)
+        return ellipsoid.failure or infeasibility(plant, tolerated, polytope=polytope, reason=reason)
     except Infeasible as none:
-        refusal = none
-    if rest is not None:  # changes are sought for a resting point of the synthesis' own choice
-        given = "this is around the resting_state that was given, without one the synthesis chooses"
-        raise Infeasible(f"{refusal}; {given}", refusal.binding, refusal.shortfall)
-    search.refusal = refusal
-    raise _with_age(refusal, plant, contract, search, polytope=polytope)
-
-
-def _with_age(
-    refusal: Infeasible, plant: LinearPlant, contract: ChannelContract | None, search: Search, *, polytope: bool
-) -> Infeasible:
-    """Returns a refusal with an age of samples that has a certificate."""
-
-    def certifies(promised: ChannelContract) -> bool:
-        return nearby_certificate(plant, promised, polytope=polytope, progress=search) is not None
-
-    return with_age_that_helps(refusal, plant, contract, certifies, search, polytope=polytope)
+        return none
 
 
 def carried_over(certificate: Certificate, plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
@@ -182,15 +183,8 @@ def nearby_certificate(
         progress: Called with a line of text now and then.
     """
     carried = None if start is None else carried_over(start, plant, contract)
-    rest, known = None, []
-    try:
-        if not needs_resting_point(plant):
-            rest = at_operating_point(plant)
-            ellipsoid = largest_ellipsoid(plant, contract, Search(progress), start, _FEW_ALTERNATIONS)
-            if ellipsoid.certificate is not None or carried is not None or not polytope:
-                return ellipsoid.certificate or carried
-            known = [] if ellipsoid.K is None else [ellipsoid.K]
-        found = around_resting_point(plant, contract, progress, rest, known).certificate
-    except Infeasible:
+    alone = polytope and (carried is None or needs_resting_point(plant))
+    found = _found(plant, contract, Search(progress), None, start, _FEW_ALTERNATIONS, polytope=alone)
+    if not isinstance(found, Certificate):
         return carried
-    return max(filter(None, [found, carried]), key=polytope_share, default=None)
+    return found if carried is None or found.keeps_ellipsoid else max(found, carried, key=polytope_share)

@@ -143,12 +143,15 @@ def with_tolerated_scale(certificate: Certificate, plant: LinearPlant, problem: 
     It is 1 at least, because this certificate exists: the search for a larger one is local, and covers the error sets
     of all ages by one. Of a polytope alone it is what its own gain bears.
     """
+    scale = 1.0
     if certificate.keeps_ellipsoid:
         gain = max_margin_gain(problem, problem.covering_error_shape, searches=1)
-        found = None if gain is None else of_ellipsoid(plant, problem, gain)
+        if gain is not None:
+            scale = gain.margin if plant.grid_rows is None else of_ellipsoid(plant, problem, gain).margin
     else:
-        found = Tolerance(plant, certificate.error_shapes, certificate.D, at_operating_point(plant)).of(certificate.K)
-    scale = 1.0 if found is None else found.margin
+        tolerance = Tolerance(plant, certificate.error_shapes, certificate.D, at_operating_point(plant))
+        if (found := tolerance.of(certificate.K)) is not None:
+            scale = found.margin
     record = {"tolerated_scale": float(exact.rounded(max(scale, 1.0), 3))}
     return replace(certificate, provenance=certificate.provenance | record)
 

@@ -46,14 +46,6 @@ _LEAST_POINTS = 4000
 _MOST_STEPS = 3000
 
 
-class TooManyRowsError(Infeasible):
-    """There may be a polytope, but not within the limits of rows."""
-
-    def __init__(self, reason: str) -> None:
-        """Begins with the reason."""
-        super().__init__(reason, "P", 0.0)
-
-
 class Feedback(NamedTuple):
     """The fallback u = u_c + K (x_hat - x_c) with what disturbs it.
 
@@ -107,11 +99,11 @@ def invariant_polytopes(
         implied = _IMPLIED if margin == MARGINS[0] else _NEARLY_IMPLIED * margin
         try:
             yield _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied)
-            failure = failure or Infeasible("its numbers are out of reach", "P", 0.0)
-        except TooManyRowsError as too_many:
-            failure = too_many
-            progress(f"polytope: {failure}")
         except Infeasible as infeasible:
+            if infeasible.binding == "R":
+                failure = infeasible
+                progress(f"polytope: {failure}")
+                continue
             failure = failure or infeasible
             if margin == min(MARGINS):  # a larger one leaves less
                 break
@@ -125,13 +117,13 @@ def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: 
     A state along which it would have no end gets the limit within which its gain was sought.
     """
     kept = len(step.plant.box)
-    faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied)
+    faces = invariant_faces(step.first_faces(), step.predecessor, kept, progress, implied)
     extents = _extents(faces) if step.has_free_states else np.ones(step.plant.n)
     if (np.abs(np.log10(extents)) > _SIMILAR).any():  # how far states go is known now
         step.limited = np.isinf(extents)
         step.widths = step.widths * np.where(step.limited, 1.0, extents)
-        faces = _faces_that_cut(step.first_faces(), step.predecessor, kept, progress, implied)
-    return _rounded(step, _faces_that_count(faces, kept, progress, implied))
+        faces = invariant_faces(step.first_faces(), step.predecessor, kept, progress, implied)
+    return _rounded(step, faces)
 
 
 def invariant_faces(
@@ -139,6 +131,7 @@ def invariant_faces(
     predecessor: Callable[[Faces], Faces],
     kept: int,
     progress: Callable[[str], object] = lambda line: None,
+    implied: float = _IMPLIED,
 ) -> Faces:
     """Returns the faces of the largest polytope in another one whose states stay in it.
 
@@ -147,47 +140,34 @@ def invariant_faces(
         predecessor: Of a row, what states fulfil exactly if the next ones fulfil the row for sure.
         kept: So many of the first rows stay even where others imply them; such rows are not followed then.
         progress: Called with a line of text now and then.
+        implied: A row is added if it cuts off more than that.
 
     Raises:
         Infeasible: If there are none within `MOST_ROWS` rows and `MOST_FOLLOWED` that are followed, or `predecessor`
             raises it.
     """
-    faces = _faces_that_cut(faces, predecessor, kept, progress, _IMPLIED)
-    return _faces_that_count(faces, kept, progress, _IMPLIED)
-
-
-def _faces_that_cut(
-    faces: Faces,
-    predecessor: Callable[[Faces], Faces],
-    kept: int,
-    progress: Callable[[str], object],
-    implied: float,
-) -> Faces:
-    """Returns the faces of `invariant_faces` with some that later ones imply.
-
-    A row is added if it cuts off more than `implied`.
-
-    Raises:
-        Infeasible: If there are too many rows, or too many are followed.
-    """
     if kept > MOST_ROWS:
         raise _none(
             f"the safe box alone has {kept} rows, and it would need {MOST_ROWS} at most: leave out implied ones"
         )
+    own = faces.some(slice(kept))
     faces, _ = _without_implied(faces, kept, implied)
     within = Extremes(faces)
     following, followed, most = 0, 0, MOST_ROWS
     while following < len(within.faces.rows):
         if following < kept and not any(_cuts_others(within, following, implied)):
+            within.set_ends(following, -math.inf, math.inf)  # so that of two equal rows one is followed
             following += 1
             continue
         if len(within.faces.rows) > most:  # what later ones imply leads nowhere else, either
             faces, following = _without_implied(within.faces, kept, implied, following)
             if len(faces.rows) > MOST_ROWS:
-                raise _too_many()
+                raise _too_many(
+                    f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance"
+                )
             within, most = Extremes(faces), max(MOST_ROWS, int(_GROWN * len(faces.rows)))
         if followed >= MOST_FOLLOWED:
-            raise TooManyRowsError(f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps")
+            raise _too_many(f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps")
         if following % 50 == 0:
             progress(f"polytope: {len(within.faces.rows)} rows")
         row = predecessor(within.faces.some([following]))
@@ -195,15 +175,11 @@ def _faces_that_cut(
         if low or high:
             within.add(row._replace(low=row.low if low else OPEN[0], high=row.high if high else OPEN[1]))
         following, followed = following + 1, followed + 1
-    return within.faces
-
-
-def _faces_that_count(faces: Faces, kept: int, progress: Callable[[str], object], implied: float) -> Faces:
-    """Returns faces without those that others imply."""
+    faces = own.followed_by(within.faces.some(slice(kept, None)))
     progress(f"polytope: which of {len(faces.rows)} rows count")
     faces = _bounding_every_state(_without_implied(faces, kept, implied)[0], kept)
     if len(faces.rows) > MOST_ROWS:
-        raise _too_many()
+        raise _too_many(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
     return faces
 
 
@@ -419,8 +395,8 @@ def _none(reason: str) -> Infeasible:
     return Infeasible(reason, "P", 0.0)
 
 
-def _too_many() -> TooManyRowsError:
-    return TooManyRowsError(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
+def _too_many(reason: str) -> Infeasible:
+    return Infeasible(reason, "R", 0.0)
 
 
 def _extents(faces: Faces) -> np.ndarray:

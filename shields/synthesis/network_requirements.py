@@ -72,7 +72,7 @@ class Requirements:
 def share_of(certificate: Certificate) -> tuple[str, float]:
     """Returns what fills how much of the safe box: ("ellipsoid", share), of limits with two ends ("polytope", share).
 
-    Where the box has too many corners to know its volume, the share of its largest ellipsoid; ("certificate", 1.0)
+    Where the box has more rows than states, the share of its largest ellipsoid; ("certificate", 1.0)
     where nothing is known, as of a box that is open.
     """
     known, polytope = certificate.provenance, certificate.polytope

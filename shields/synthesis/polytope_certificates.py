@@ -13,7 +13,6 @@ from ncs_gym.network.contract import ChannelContract
 from shields.certificate import Certificate
 from shields.errors import CertificateError, Infeasible
 from shields.polytope import Polytope
-from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.certificate_fields import (
     fields_of_problem,
     gain_in_digits,
@@ -23,8 +22,8 @@ from shields.synthesis.certificate_fields import (
     shape_in_digits,
     volume_of,
 )
-from shields.synthesis.design_problem import CandidateDesign, Rest, design_problem
-from shields.synthesis.ellipsoid_certificates import MORE_DIGITS, SLACKS, progress_text
+from shields.synthesis.design_problem import Rest, design_problem
+from shields.synthesis.ellipsoid_certificates import MORE_DIGITS
 from shields.synthesis.invariant_polytope import (
     Feedback,
     feedback_of,
@@ -37,7 +36,6 @@ from shields.synthesis.invariant_polytope import (
 from shields.synthesis.resting_point import (
     at_operating_point,
     disturbance_around,
-    farthest_from_limits,
     improved,
     limits_around,
 )
@@ -185,7 +183,7 @@ def around_resting_point(
     contract: ChannelContract | None,
     progress: Progress,
     fixed: Rest | None = None,
-    known: Sequence[np.ndarray] | None = None,
+    known: Sequence[np.ndarray] = (),
 ) -> FoundPolytope:
     """Returns a verified certificate of a polytope alone, around a resting point, or what the best gain bears.
 
@@ -196,14 +194,12 @@ def around_resting_point(
         contract: Channel contract; None for none.
         progress: Called with a line of text now and then.
         fixed: The resting point; the one that suits each gain by default.
-        known: Gains, shape (m, n), that are tried as well; by default that of the largest ellipsoid, which is sought.
+        known: Gains, shape (m, n), that are tried as well.
 
     Raises:
         Infeasible: If the plant has no error set, or no resting point.
     """
-    progress("resting point")
-    known = _ellipsoid_gain(plant, contract, progress, fixed) if known is None else known
-    progress("gain that tolerates most")
+    progress("resting point and the gain that tolerates most")
     gains = tolerated_gains(plant, contract, fixed, known)
     best = max(gains, key=lambda each: each.margin, default=None)
     tried = _by_share([each for each in gains if each.margin >= 1.0], plant, contract, progress, fixed)
@@ -244,19 +240,6 @@ def _by_share(
         better = improved(plant, gains[0].rest, lambda rest: share(gains[0].K, rest))
         gains = [gains[0]._replace(rest=better), *gains] if better is not gains[0].rest else gains
     return gains
-
-
-def _ellipsoid_gain(
-    plant: LinearPlant, contract: ChannelContract | None, progress: Progress, fixed: Rest | None
-) -> list[np.ndarray]:
-    """Returns the gain of the largest ellipsoid, shape (m, n), for symmetric limits around a point, if there is one."""
-    problem, _ = design_problem(plant, contract, limits_around(plant, fixed or farthest_from_limits(plant)))
-
-    def report(stage: str, design: CandidateDesign | None) -> None:
-        progress(progress_text(stage, design))
-
-    found = largest_set(problem, SLACKS[0], report)
-    return [] if found is None else [problem.to_physical(found.L, with_best_gain(problem, found).K)[1]]
 
 
 def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress) -> Certificate:

@@ -99,16 +99,8 @@ class Tolerance:
 
     def of(self, K: np.ndarray) -> Tolerated | None:
         """Returns what a gain, shape (m, n), bears; None if it is too slow to tell."""
-        needs = self.needs(K)
-        return None if needs is None else self._around(K, needs)
-
-    def needs(self, K: np.ndarray) -> np.ndarray | None:
-        """Returns how far errors and disturbances take every limit from rest, in units of half its range, shape (r,).
-
-        None for a gain that is too slow to tell.
-        """
-        found = self._needs_and_slopes(self._scaled(K))
-        return None if found is None else found[0]
+        found = self._needs_and_slopes(self._scaled(K), slopes=False)
+        return None if found is None else self._around(K, found[0])
 
     def improved(self, K: np.ndarray, enough: float = np.inf) -> Tolerated | None:
         """Returns the gain of the largest margin near a given one: sequential quadratic programming, with derivatives.
@@ -191,8 +183,11 @@ class Tolerance:
     def _physical(self, K: np.ndarray) -> np.ndarray:
         return K / self._x * self._u[:, None]
 
-    def _needs_and_slopes(self, K: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Returns the needs (r,) of a scaled gain and their derivatives, shape (r, m, n)."""
+    def _needs_and_slopes(self, K: np.ndarray, *, slopes: bool = True) -> tuple[np.ndarray, np.ndarray] | None:
+        """Returns how far errors and disturbances take every limit from rest under a scaled gain, in half ranges, (r,).
+
+        The second are the derivatives, shape (r, m, n), if they are asked for. None if the gain is too slow to tell.
+        """
         closed_loop, answer = self._A + self._B @ K, self._B @ K
         first = self._state + self._input @ K
         radius = float(np.abs(np.linalg.eigvals(closed_loop)).max()) if np.isfinite(closed_loop).all() else np.inf
@@ -208,6 +203,9 @@ class Tolerance:
         by_errors, to_errors = _support(rows @ answer, self._errors)
         at_once, to_input = _support(self._input @ K, self._errors)
         needs = by_disturbance.sum(axis=0) + by_errors.sum(axis=0) + at_once + self._limits.disturbed
+        needs = np.maximum(needs, _SMALLEST_NEED)
+        if not slopes:
+            return needs, np.empty((0, *K.shape))
         # The chain rule, backwards: what a row of one step adds to all later ones.
         to_rows, later = to_disturbance + to_errors @ answer.T, np.zeros_like(first)
         summed = np.empty_like(rows)
@@ -215,8 +213,8 @@ class Tolerance:
             summed[i] = later = to_rows[i] + later @ closed_loop.T
         by_loop = np.einsum("tri,trj->rij", rows[:-1], summed[1:])
         by_answer = np.einsum("tri,trj->rij", rows, to_errors)
-        slopes = self._B.T @ (by_loop + by_answer) + self._input[:, :, None] * (summed[0] + to_input)[:, None, :]
-        return np.maximum(needs, _SMALLEST_NEED), slopes
+        by_input = self._input[:, :, None] * (summed[0] + to_input)[:, None, :]
+        return needs, self._B.T @ (by_loop + by_answer) + by_input
 
 
 def _support(rows: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -238,7 +236,7 @@ def tolerated_gains(
     known: Sequence[np.ndarray] = (),
     enough: float = np.inf,
 ) -> list[Tolerated]:
-    """Returns gains with what they bear: given ones, that of the tolerant ellipsoid, the most tolerant, regulators.
+    """Returns gains with what they bear: given ones, the most tolerant one, regulators.
 
     Args:
         plant: The plant.
@@ -251,11 +249,9 @@ def tolerated_gains(
         Infeasible: If the plant has no error set, or no resting point.
     """
     rest = fixed or farthest_from_limits(plant)
-    problem, errors = design_problem(plant, contract, limits_around(plant, rest))
+    _, errors = design_problem(plant, contract, limits_around(plant, rest))
     tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest), fixed)
-    start = max_margin_gain(problem, problem.covering_error_shape)
-    gains = [*known, *([] if start is None else [problem.to_physical(start.L, start.K)[1]])]
-    first, others = ([found for K in each if (found := tolerance.of(K))] for each in (gains, regulators(plant)))
+    first, others = ([found for K in gains if (found := tolerance.of(K))] for gains in (known, regulators(plant)))
     best = max([*first, *others], key=lambda each: each.margin, default=None)
     if best is None or best.margin >= enough:
         return [*first, *others]

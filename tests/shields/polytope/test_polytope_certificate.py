@@ -119,11 +119,12 @@ def small_plant(**changes):
     return linear_plant(**(given | noise | changes))
 
 
-def test_box_with_nearly_the_same_row_twice_keeps_the_ellipsoid_and_says_what_helps():
-    certificate = synthesize(small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1e-9]])))
-    assert certificate.polytope is None
-    assert "leave out rows of the box that are nearly the same as others" in " ".join(str(certificate).split())
-    assert synthesize(small_plant()).polytope is not None
+@pytest.mark.parametrize("again", [[1.0, 0.0], [1.0, 1e-9], [2.0, 0.0]])
+def test_box_with_nearly_the_same_row_twice_has_its_polytope(again):
+    plant = small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], again]))
+    found = synthesize(plant)
+    assert verified(found, plant).valid
+    assert found.polytope is not None
 
 
 def test_box_of_more_rows_than_a_polytope_has_says_so():

@@ -1,4 +1,4 @@
-"""The share of the safe box that a set fills, against counts of random points."""
+"""The share of the safe box that a set fills, and the reach that is said instead."""
 
 from dataclasses import replace
 
@@ -8,18 +8,10 @@ import pytest
 from ncs_gym import Ellipsoid, truck_trailer
 from shields import verify
 from shields.certificate_text import size_of
-from shields.synthesis.certificate_fields import reach_recorded
-from shields.synthesis.share_of_box import share_of_box
+from shields.synthesis.certificate_fields import reach_recorded, share_of_box
 from tests.certificates import certificate_of
 from tests.plants import delayed, random_plant
 from tests.product import altered, linear_plant, synthesize
-
-
-def counted(C, L, reach):
-    """The share of random points of the box {|c_j x| <= 1}, all with |x_i| <= reach, that lie in E(L)."""
-    points = np.random.default_rng(0).uniform(-reach, reach, (400_000, len(L)))
-    points = points[(np.abs(points @ C.T) <= 1.0).all(axis=1)]
-    return float((np.einsum("ki,ij,kj->k", points, np.linalg.inv(L), points) <= 1.0).mean())
 
 
 def test_largest_ellipse_fills_a_quarter_of_pi_whatever_the_units():
@@ -28,25 +20,7 @@ def test_largest_ellipse_fills_a_quarter_of_pi_whatever_the_units():
         assert share_of_box(plant, np.diag(np.square(units)))["share_of_box"] == pytest.approx(np.pi / 4.0, rel=1e-12)
 
 
-@pytest.mark.parametrize(("n", "rows"), [(1, 3), (2, 3), (2, 5), (3, 4), (3, 6)])
-def test_share_of_a_box_with_more_rows_than_states_agrees_with_counts(n, rows):
-    rng = np.random.default_rng(10 * n + rows)
-    C = np.concatenate([np.eye(n), rng.standard_normal((rows - n, n))])
-    root = rng.standard_normal((n, n))
-    L = root @ root.T + np.eye(n)
-    L /= np.einsum("ji,ik,jk->j", C, L, C).max()  # inside the box
-    share = share_of_box(altered(random_plant(0, n, 1), box=C), L)["share_of_box"]
-    assert share == pytest.approx(counted(C, L, 1.0), abs=5e-3)
-
-
-def test_rows_that_say_nothing_new_change_nothing():
-    plant = truck_trailer()
-    again = altered(plant, box=np.concatenate([plant.box_rows, 0.9 * plant.box_rows]))
-    L = np.diag([3.0, 1.0])
-    assert share_of_box(again, L)["share_of_box"] == pytest.approx(share_of_box(plant, L)["share_of_box"], rel=1e-9)
-
-
-def test_too_many_corners_are_no_number_and_the_reach_is_said_instead(certificate):
+def test_box_with_more_rows_than_states_has_no_share_and_the_reach_is_said_instead(certificate):
     plant = random_plant(0, 6, 1)
     box = np.concatenate([np.eye(6), np.full((1, 6), 0.1)])
     plant, L = altered(plant, box=box), 0.25 * np.eye(6)
