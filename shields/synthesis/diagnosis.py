@@ -104,7 +104,7 @@ def _may_be_helped(infeasible: Infeasible, plant: LinearPlant, contract: Channel
     """Returns whether less age may help: not against too many rows of a polytope, where a gain bears all."""
     if infeasible.binding == "E1":
         return contract is not None and _has_error_sets(plant, replace(contract, max_age=0))
-    return infeasible.binding not in ("S", "P") and infeasible.shortfall < 1.0
+    return infeasible.binding not in ("S", "P", "R") and infeasible.shortfall < 1.0
 
 
 def _has_error_sets(plant: LinearPlant, contract: ChannelContract) -> bool:

@@ -122,7 +122,7 @@ def certify_polytope(
         rest = at_operating_point(plant) if rest is None else rest
         return _certified_polytope(plant, K, contract, progress, rest)
     except _NOT_CERTIFIED as failure:
-        if isinstance(failure, Infeasible) and failure.binding != "P":
+        if isinstance(failure, Infeasible) and failure.binding not in ("P", "R"):
             raise
         return None
 
