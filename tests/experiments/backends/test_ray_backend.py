@@ -24,7 +24,7 @@ from tests.experiments.backends.small_runs import Small  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
-GRID = ["--losses", "0.5", "--delays", "1", "--burst-lengths", "0", "3", "--seeds", "2", "--episodes", "3"]
+GRID = ["--losses", "0.4", "0.5", "--delays", "1", "--seeds", "2", "--episodes", "3"]
 GRID += ["--steps", "2048", "--hyperparams", "n_envs=4"]
 RUNS = 8
 TIMEOUT = 300.0
