@@ -182,8 +182,9 @@ class OneGuard(Guard):
         return decision
 
     def input(self, u: np.ndarray) -> np.ndarray:
-        """Returns the input to apply in place of a proposed one, shape (m,)."""
-        return self.decide(u).input
+        """Returns the input to apply in place of a proposed one, shape (m,): itself if it may act."""
+        decision = self.decide(u)
+        return decision.input if decision.intervened else u
 
     @property
     def charge(self) -> float:
