@@ -106,10 +106,10 @@ class HardBounds(LimitValues):
     of_first_error: Source
     remainder: Any
     delta: float
+    process_noise: TruncatedGaussian
+    sensor_noise: TruncatedGaussian
+    initial_noise: TruncatedGaussian
     gamma = setting("gamma", "of_disturbance.ball")
-    process_noise = setting("process_noise", "of_disturbance.noise")
-    sensor_noise = setting("sensor_noise", "of_sensor.noise")
-    initial_noise = setting("initial_noise", "of_first_error.noise")
     disturbance_bound = setting("disturbance_bound", "of_disturbance.bound")
     sensor_bound = setting("sensor_bound", "of_sensor.bound")
     initial_bound = setting("initial_bound", "of_first_error.bound")

@@ -92,8 +92,9 @@ class LinearPlant(BetweenSamples):
             shape = np.zeros((n, n)) if disturbance.bound is None else disturbance.bound.shape_matrix[:n, :n]
             held = with_residual(Ellipsoid(shape), rest.lacking, rows).shape_matrix
             disturbance = disturbance._replace(bound=Ellipsoid(np.pad(held, (0, past))))
-        self._set(of_disturbance=disturbance, of_sensor=Source.of(sums[1], np.eye(self.p)))
-        self._set(of_first_error=Source.of(sums[2], weight, past))
+        sensor, first = Source.of(sums[1], np.eye(self.p)), Source.of(sums[2], weight, past)
+        self._set(of_disturbance=disturbance, of_sensor=sensor, of_first_error=first)
+        self._set(process_noise=disturbance.noise, sensor_noise=sensor.noise, initial_noise=first.noise)
         self._set(delta=next((each.gaussian.delta for each in sums if each.gaussian), DELTA))
 
     def _name(self) -> None:
