@@ -110,6 +110,14 @@ def test_most_tolerant_gain_is_the_same_wherever_its_search_begins():
     assert told.value.details["share_of_radii"] == pytest.approx(0.60752, abs=2e-5)
 
 
+def test_regulators_that_are_too_slow_to_tell_are_replaced_by_faster_ones():
+    """Of a ball on a plate: its position is free up to 10 km, so that a regulator hardly cares for it."""
+    plant, contract = plant_of("bap_gepoc"), contract_of_plant("bap_gepoc")
+    tolerance, _ = tolerance_of(plant, contract)
+    assert not any(tolerance.of(K) for K in regulators(plant))
+    assert most_tolerated(plant, contract, polytope=True).margin == pytest.approx(0.7446, abs=1e-3)
+
+
 def test_polytope_that_fails_the_exact_check_is_sought_with_a_larger_margin(monkeypatch):
     plant, checked = servo(1.0), []
 
