@@ -176,8 +176,6 @@ def replaced(plant, **values):
     sources = {f"{kind}_bound": f"of_{source}" for kind, source in SOURCES.items()}
     for name in sources.keys() & values.keys():
         values[sources[name]] = getattr(plant, sources[name])._replace(bound=values.pop(name))
-    if "process_noise" in values:
-        values["of_disturbance"] = plant.of_disturbance._replace(noise=values.pop("process_noise"))
     faulty = object.__new__(type(plant))
     faulty.__dict__.update(plant.__dict__ | values)
     if "remainder" in values:
