@@ -415,6 +415,7 @@ def test_state_that_only_follows_needs_no_limit():
     assert verified(synthesize(plant, contract=ChannelContract(1)), plant).valid
 
 
+@pytest.mark.slow
 def test_of_gains_that_bear_just_too_little_a_search_finds_one_that_bears_more():
     crane, contract = plant_of("port_crane"), contract_of_plant("port_crane")
     gains = sorted(each.margin for each in tolerated_gains(crane, contract))
