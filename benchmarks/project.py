@@ -227,8 +227,8 @@ def fate(stages: int, mutant: Mutant) -> str:
             if (ROOT / name).is_file():
                 shutil.copyfile(ROOT / name, copied / name)
         (copied / mutant.file).write_text(mutant.source)
-        package, inner = Path(mutant.file).parts[:2]
-        for tests in (f"tests/{package}/{inner}", f"tests/{package}", "tests")[:stages]:
+        package, *inner = Path(mutant.file).parts[:-1]
+        for tests in (f"tests/{package}/{inner[-1]}", f"tests/{package}", "tests")[:stages]:
             if (copied / tests).exists() and (noticed := _first_failure(copied, tests)):
                 return noticed
     return ""
