@@ -14,7 +14,6 @@ from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import GuardedLoop, Loop, OneLoop
 from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
 from ncs_gym.envs.spaces import Observer, actions_of, observation_space, read_action, read_observed
-from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import Inputs, no_inputs
@@ -157,7 +156,6 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
     _now: OneLoop
     task: Task = setting("task")
     terminate_on_violation: bool = setting("terminate_on_violation")
-    estimator: Estimator = setting("estimator", "_now.estimator")
     horizon: int = setting("horizon")
     observe: tuple[str, ...] = setting("observe")
     steps: int = setting("steps", "_now.steps")
@@ -316,12 +314,12 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: If the channel does not take samples on request.
         """
-        return int(require_on_request(self._now.requests).outstanding(self.estimator.age))
+        return int(require_on_request(self._now.requests).outstanding(self._now.estimator.age))
 
     @property
     def request_state(self) -> tuple[int, int]:
         """The age of the newest sample used, and `outstanding` [steps, samples]."""
-        return self.estimator.age, self.outstanding
+        return self._now.estimator.age, self.outstanding
 
     @property
     def request_limits(self) -> np.ndarray:

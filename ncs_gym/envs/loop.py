@@ -250,7 +250,7 @@ class LoopState(CopiedWhole, ABC):
             cost = (np.maximum.reduce(worst) > 0.0).astype(np.float64)
             values = values.copy() if values is worst else values
             age, damaged, outside = (frozen(each.copy()) for each in (age, damaged, outside))
-            for array in (estimate, number, alarm):
+            for array in (estimate, number, alarm, self.moves):
                 frozen(array)
             if self.requests is None:
                 asked = forced = self.nothing

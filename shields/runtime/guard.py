@@ -35,8 +35,8 @@ class Guard(CopiedWhole, ABC):
     """Decides the inputs of a loop and follows whether they prove that its state stays in S, or in the box.
 
     It stands inside the loop, where nothing comes between what is decided and what is applied, and knows what a
-    controller can know. Every step is one `input` and one `observe`. Its claim asks that the loop moved one step in
-    between, and that the input applied is the one that was due, whatever moved it.
+    controller can know. Every step is one `input` and one `observe`. Its claim asks that the loop moved one step for
+    every input decided, and that the input applied is the one that was due, whatever moved it.
 
     Args:
         safety_filter: Makes the decisions.
@@ -74,7 +74,7 @@ class Guard(CopiedWhole, ABC):
     _proposed: np.ndarray
     _stored: np.ndarray
     _state: MonitorState
-    # The clock of the loop when it was observed last.
+    # What the clock of the loop says once it has moved one step for every input decided.
     _moves: Any
 
     def observe(self, belief: Belief) -> None:
@@ -85,7 +85,7 @@ class Guard(CopiedWhole, ABC):
         else:
             on_time = _equal(belief.applied, schedule.due(decided))
             same_input = _equal(belief.committed, decided)
-        moved_once, self._moves = belief.moves == self._moves + 1, belief.moves
+        moved_once, self._moves = belief.moves == self._moves, belief.moves
         self._drop(moved_once & same_input & on_time)
         self._take(belief)
         happened = self._decision, moved_once, same_input, belief, self.errors, on_time
@@ -177,7 +177,7 @@ class OneGuard(Guard):
     def decide(self, proposed: np.ndarray) -> Decision:
         """Returns the decision about a proposed input, shape (m,), at the belief observed last; never raises."""
         decision = self.filter.decide(self.belief.estimate, self.errors, proposed, self._stored)
-        self._decision, self._proposed = decision, proposed
+        self._decision, self._proposed, self._moves = decision, proposed, self._moves + 1
         self._stored = decision.plan.copy() if len(decision.plan) else decision.plan
         return decision
 
@@ -307,7 +307,7 @@ class ManyGuards(Guard):
         """Returns the inputs to apply in place of proposed ones, shape (m, N)."""
         decided = self.filter.decide_columns(self.belief.estimate, self.errors, u, self._stored)
         self._decision, self._proposed, self._counted = decided, u, ~self._none
-        self._stored = decided.plan.copy()
+        self._stored, self._moves = decided.plan.copy(), self._moves + 1
         return decided.input
 
     @property

@@ -83,8 +83,8 @@ class _Shield(RecordConstructorArgs):
                 f"its estimator keeps other error sets: give it contract={promised}",
                 BrokenContractWarning,
             )
-        inner.install(self._guard)
         self._wrapper.__init__(self, env)
+        inner.install(self._guard)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts episodes; see the environment's.
