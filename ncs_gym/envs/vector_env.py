@@ -141,10 +141,10 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         super().reset(seed=seed)
         if seed is not None:
             self._now.process.forget()
-        if not (self._consistent or mask.all()):
-            raise gym.error.ResetNeeded("reset all environments first")
         chosen = np.flatnonzero(mask).tolist()
         sources = self._now.drawn(sources, self.np_random, chosen)
+        if not (self._consistent or mask.all()):
+            raise gym.error.ResetNeeded("reset all environments first")
         self._consistent = False
         self._now.give(sources, chosen)
         observation, info = self._begin(mask, starts, fixed)

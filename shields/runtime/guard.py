@@ -35,8 +35,8 @@ class Guard(CopiedWhole, ABC):
     """Decides the inputs of a loop and follows whether they prove that its state stays in S, or in the box.
 
     It stands inside the loop, where nothing comes between what is decided and what is applied, and knows what a
-    controller can know. Every step is one `input` and one `observe`. Its claim asks that the loop moved one step for
-    every input decided, and that the input applied is the one that was due, whatever moved it.
+    controller can know. Every step is one `input` and one `observe`. Its claim asks that one input was decided and the
+    loop moved one step between two observations, and that the input applied is the one that was due.
 
     Args:
         safety_filter: Makes the decisions.
@@ -74,8 +74,9 @@ class Guard(CopiedWhole, ABC):
     _proposed: np.ndarray
     _stored: np.ndarray
     _state: MonitorState
-    # What the clock of the loop says once it has moved one step for every input decided.
+    # The clock of the loop when it was observed last, and how many inputs were decided since.
     _moves: Any
+    _asked = 0
 
     def observe(self, belief: Belief) -> None:
         """Takes in what is known after the step that followed the decision."""
@@ -85,7 +86,8 @@ class Guard(CopiedWhole, ABC):
         else:
             on_time = _equal(belief.applied, schedule.due(decided))
             same_input = _equal(belief.committed, decided)
-        moved_once, self._moves = belief.moves == self._moves, belief.moves
+        moved_once = (belief.moves == self._moves + 1) & (self._asked == 1)
+        self._moves, self._asked = belief.moves, 0
         self._drop(moved_once & same_input & on_time)
         self._take(belief)
         happened = self._decision, moved_once, same_input, belief, self.errors, on_time
@@ -161,7 +163,7 @@ class OneGuard(Guard):
             pending: The inputs decided for the next c steps, none of them at the start of an episode.
         """
         self._take(belief)
-        self._moves = belief.moves
+        self._moves, self._asked = belief.moves, 0
         self._stored, is_safe = first_store(self.filter, belief.estimate, self.errors, known[-1])
         self._state = self._monitor.start(is_safe, belief, self.errors, is_first=is_first)
         if self._schedule is not None:
@@ -177,7 +179,7 @@ class OneGuard(Guard):
     def decide(self, proposed: np.ndarray) -> Decision:
         """Returns the decision about a proposed input, shape (m,), at the belief observed last; never raises."""
         decision = self.filter.decide(self.belief.estimate, self.errors, proposed, self._stored)
-        self._decision, self._proposed, self._moves = decision, proposed, self._moves + 1
+        self._decision, self._proposed, self._asked = decision, proposed, self._asked + 1
         self._stored = decision.plan.copy() if len(decision.plan) else decision.plan
         return decision
 
@@ -279,8 +281,8 @@ class ManyGuards(Guard):
                 estimate, errors = belief.estimate[:, e].copy(), self.errors.single(e)
                 plan, is_safe[e] = first_store(self.filter, estimate, errors, known[e][-1])
                 self._stored[: len(plan), :, e] = plan
-        self._leave(~mask & (belief.moves != self._moves))
-        self._moves = belief.moves
+        self._leave(~mask & ((belief.moves != self._moves) | (self._asked > 0)))
+        self._moves, self._asked = belief.moves, 0
         started = self._monitor.start(is_safe, belief, self.errors)
         self._state = MonitorState(*(np.where(mask, *both) for both in zip(started, self._state, strict=True)))
         if self._schedule is not None:
@@ -307,7 +309,7 @@ class ManyGuards(Guard):
         """Returns the inputs to apply in place of proposed ones, shape (m, N)."""
         decided = self.filter.decide_columns(self.belief.estimate, self.errors, u, self._stored)
         self._decision, self._proposed, self._counted = decided, u, ~self._none
-        self._stored, self._moves = decided.plan.copy(), self._moves + 1
+        self._stored, self._asked = decided.plan.copy(), self._asked + 1
         return decided.input
 
     @property

@@ -194,6 +194,39 @@ def test_an_input_that_is_decided_and_not_applied_ends_the_claim(made, mode):
         assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_STEPS)
     assert np.all(shield.reset()[1]["shield_guaranteed"])
     assert np.all(shield.step(action)[-1]["shield_guaranteed"])
+    u = env.guard.input(np.zeros(np.shape(env.belief.applied)))
+    env._now.move(env.np_random, u, env._move_task)
+    assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_STEPS)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_an_input_without_its_step_ends_the_claim_also_where_others_begin(moves):
+    shield = vector(on_unproved="ignore")
+    env = shield.unwrapped
+    shield.reset(seed=0)
+    u = env.guard.input(np.zeros((1, 2)))
+    if moves:
+        env._now.move(env.np_random, u, env._move_task)
+    info = shield.reset(options={"reset_mask": np.array([True, False])})[1]
+    assert info["shield_reason"].tolist() == ["", OTHER_STEPS]
+    info = shield.step(np.zeros((2, 1)))[-1]
+    assert info["shield_reason"].tolist() == ["", OTHER_STEPS]
+
+
+def test_a_step_that_fails_inside_a_partial_reset_is_no_episode_that_goes_on(monkeypatch):
+    shield = vector()
+    env, move = shield.unwrapped, shield.unwrapped._now.move
+
+    def drawn(rng):
+        with monkeypatch.context() as patch:
+            patch.setattr(env._now, "move", lambda *given: (move(*given), 1 / 0))
+            with pytest.raises(ZeroDivisionError):
+                env.step(np.ones((2, 1)))
+        return env.channel
+
+    shield.reset(seed=0)
+    with pytest.raises(gym.error.ResetNeeded):
+        shield.reset(options={"reset_mask": np.array([True, False]), "channel": drawn})
 
 
 @pytest.mark.parametrize("copied", [lambda env: env, copy.copy, *COPIES])
