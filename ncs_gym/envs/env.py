@@ -9,14 +9,13 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import GuardedLoop, Loop, OneLoop
 from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
-from ncs_gym.envs.spaces import Observer, actions_of, observation_space, read_action, read_observed
+from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.network.downlink import Inputs, no_inputs
+from ncs_gym.network.downlink import no_inputs
 from ncs_gym.network.requests import require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
@@ -235,7 +234,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
             now.process.forget()
         now.give(sources)
         now.begin(self.np_random, start, fixed, self._begin_task)
-        info, guard = self._info(no_inputs(self.plant.m), arrived=False), self._guard
+        info, guard = self._info(no_inputs(self.plant.m), False), self._guard
         if guard is not None:
             guard.begin(now.beginning(self._belief))
             info |= guard.info()
@@ -265,7 +264,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         u = read[1] if guard is None else guard.input(read[1])
         inputs, arrived = now.move(self.np_random, u, self._move_task)
         reward = self._task.reward_one(self.plant, self._task_state, now.state, inputs.applied)
-        info = self._info(inputs, arrived=arrived, read=read)
+        info = self._info(inputs, arrived, read=read)
         if guard is not None:
             guard.observe(self._belief)
             info |= guard.info()
@@ -366,11 +365,6 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         for u in self._now.pending:
             task_state = self._task.predict_one(self.plant, task_state, u)
         return self._observer.observation(self._belief, self._task.observe(task_state))
-
-    def _info(self, inputs: Inputs, *, arrived: bool, read: Any = None) -> dict[str, Any]:
-        report = self._now.report(inputs, arrived)
-        self._belief = report.belief
-        return loop_info(report, self.loop, actions_of(inputs, self.plant, read))
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

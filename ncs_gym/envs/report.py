@@ -64,7 +64,7 @@ class Belief(NamedTuple):
 
 
 def _loaded_belief(*values: Any) -> Belief:
-    return Belief(*(frozen(each) if isinstance(each, np.ndarray) else each for each in values))
+    return Belief._make(frozen(each) if isinstance(each, np.ndarray) else each for each in values)
 
 
 class Beginning(NamedTuple):

@@ -27,8 +27,8 @@ from shields.runtime.safety_filter import NumberedErrors, SafetyFilter
 from shields.runtime.set_test import PredictedErrors, norms
 from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
 
-# Why states are not proved safe, by code.
-REASONS = np.array(EXPLANATIONS, dtype=object)
+# By code, for the codes of many loops.
+_EXPLANATIONS = np.array(EXPLANATIONS, dtype=object)
 
 
 class Guard(CopiedWhole, ABC):
@@ -47,7 +47,7 @@ class Guard(CopiedWhole, ABC):
     Attributes:
         filter: The same.
         input_delay: c, the number of steps from a decision to its effect.
-        on_unproved: The same.
+        lost: Says that states are not proved safe.
         penalty: Subtracted from the reward per intervention.
         belief: What was observed last.
         errors: What follows from the error shape of its estimate.
@@ -58,10 +58,9 @@ class Guard(CopiedWhole, ABC):
     ) -> None:
         m = safety_filter.plant.m
         self.filter, self.input_delay = safety_filter, downlink.input_delay
-        self.on_unproved, self.penalty = on_unproved, 0.0
+        self.lost, self.penalty = LostGuarantee(on_unproved, size or 1), 0.0
         self._monitor = GuaranteeMonitor(safety_filter, downlink)
         self._errors_of = NumberedErrors(safety_filter)
-        self._lost = LostGuarantee(on_unproved, size or 1)
         self._schedule = None
         if downlink.channel is not None:
             self._schedule = CommittedInputs(self.input_delay, m if size is None else (m, size))
@@ -102,7 +101,7 @@ class Guard(CopiedWhole, ABC):
 
     def tell(self) -> None:
         """Says what is new; see `LostGuarantee`."""
-        self._lost.tell()
+        self.lost.tell()
 
     def _take(self, belief: Belief) -> None:
         self.belief, self.errors = belief, self._errors_of.of(belief.table, belief.number)
@@ -125,7 +124,7 @@ class Guard(CopiedWhole, ABC):
 class OneGuard(Guard):
     """The guard of one loop."""
 
-    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol, on_unproved: str = "warn") -> None:
+    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol, on_unproved: str) -> None:
         super().__init__(safety_filter, downlink, on_unproved)
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
@@ -139,7 +138,7 @@ class OneGuard(Guard):
             self._start, self._known = start, starts_known(self.filter, start, self.input_delay)
         self.look_at(channels)
         self.start(belief, self._known, earlier)
-        self._lost.begin()
+        self.lost.begin()
         self._interventions = self._proved = self._count = 0
         margin = self.filter.margin(belief.estimate, self.errors, self._idle)
         self._decision, self._proposed = Decision(self._idle, False, False, False, margin, ""), self._idle
@@ -209,7 +208,7 @@ class OneGuard(Guard):
         self._proved += not reason
         self._interventions += decision.intervened
         if reason:
-            self._lost.note_of(reason)
+            self.lost.note_of(reason)
         ahead = {"shield_plan_length": self.plan_length} if self.filter.mode == "lookahead" else {}
         return ahead | {
             "shield_intervened": decision.intervened,
@@ -269,7 +268,7 @@ class ManyGuards(Guard):
         belief, starts, earlier, channels = beginning
         chosen, none = np.flatnonzero(mask), self._none
         self.look_at(channels)
-        self._lost.begin(mask)
+        self.lost.begin(mask)
         self._take(belief)
         known = [self._drawn] * self._size
         for e in np.flatnonzero(mask & ~np.isnan(starts[:, 0])).tolist():
@@ -326,7 +325,7 @@ class ManyGuards(Guard):
         self._interventions = self._interventions + decided.intervened
         doubted = np.count_nonzero(reasons) > 0
         if doubted:
-            self._lost.note(reasons, np.arange(self._size))
+            self.lost.note(reasons, np.arange(self._size))
         ahead = {}
         if len(self._stored):
             ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(self._stored[:, 0]), axis=0)
@@ -336,7 +335,7 @@ class ManyGuards(Guard):
             "shield_correction": norms(decided.input - proposed),
             "shield_margin": decided.margin.copy(),
             "shield_guaranteed": is_proved,
-            "shield_reason": REASONS[reasons] if doubted else self._no_reason,
+            "shield_reason": _EXPLANATIONS[reasons] if doubted else self._no_reason,
             "episode_interventions": self._interventions.copy(),
             "episode_guaranteed": self._proved / self._count,
         }

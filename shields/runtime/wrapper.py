@@ -25,7 +25,7 @@ class _Shield(RecordConstructorArgs):
     filter: SafetyFilter = setting("filter", "_guard.filter")
     mode: str = setting("mode", "_guard.filter.mode")
     horizon: int | None = setting("horizon", "_guard.filter.horizon")
-    on_unproved: str = setting("on_unproved", "_guard.on_unproved")
+    on_unproved: str = setting("on_unproved", "_guard.lost.on_unproved")
     channel: Channel = setting("channel", "_inner.channel")
 
     env: Any
