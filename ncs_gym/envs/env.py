@@ -9,15 +9,13 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import GuardedLoop, Loop, OneLoop
 from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
-from ncs_gym.envs.spaces import Observer, actions_of, observation_space, read_action, read_observed
-from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.network.downlink import Inputs, no_inputs
+from ncs_gym.network.downlink import no_inputs
 from ncs_gym.network.requests import require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
@@ -157,7 +155,6 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
     _now: OneLoop
     task: Task = setting("task")
     terminate_on_violation: bool = setting("terminate_on_violation")
-    estimator: Estimator = setting("estimator", "_now.estimator")
     horizon: int = setting("horizon")
     observe: tuple[str, ...] = setting("observe")
     steps: int = setting("steps", "_now.steps")
@@ -237,7 +234,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
             now.process.forget()
         now.give(sources)
         now.begin(self.np_random, start, fixed, self._begin_task)
-        info, guard = self._info(no_inputs(self.plant.m), arrived=False), self._guard
+        info, guard = self._info(no_inputs(self.plant.m), False), self._guard
         if guard is not None:
             guard.begin(now.beginning(self._belief))
             info |= guard.info()
@@ -267,7 +264,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         u = read[1] if guard is None else guard.input(read[1])
         inputs, arrived = now.move(self.np_random, u, self._move_task)
         reward = self._task.reward_one(self.plant, self._task_state, now.state, inputs.applied)
-        info = self._info(inputs, arrived=arrived, read=read)
+        info = self._info(inputs, arrived, read=read)
         if guard is not None:
             guard.observe(self._belief)
             info |= guard.info()
@@ -316,12 +313,12 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ValueError: If the channel does not take samples on request.
         """
-        return int(require_on_request(self._now.requests).outstanding(self.estimator.age))
+        return int(require_on_request(self._now.requests).outstanding(self._now.estimator.age))
 
     @property
     def request_state(self) -> tuple[int, int]:
         """The age of the newest sample used, and `outstanding` [steps, samples]."""
-        return self.estimator.age, self.outstanding
+        return self._now.estimator.age, self.outstanding
 
     @property
     def request_limits(self) -> np.ndarray:
@@ -368,11 +365,6 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         for u in self._now.pending:
             task_state = self._task.predict_one(self.plant, task_state, u)
         return self._observer.observation(self._belief, self._task.observe(task_state))
-
-    def _info(self, inputs: Inputs, *, arrived: bool, read: Any = None) -> dict[str, Any]:
-        report = self._now.report(inputs, arrived)
-        self._belief = report.belief
-        return loop_info(report, self.loop, actions_of(inputs, self.plant, read))
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

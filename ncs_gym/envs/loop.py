@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos, covering, downlinks, uplinks
+from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.loop_settings import CHANNELS, expect, loop_contracts, starting_set
 from ncs_gym.envs.report import Beginning, Belief, Guard, Report
+from ncs_gym.envs.spaces import actions_of
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
@@ -153,6 +155,12 @@ class GuardedLoop:
             raise ValueError("the environment has a shield already: leave one out, or make an environment for each")
         self._guard, self._consistent = guard, False
 
+    def _info(self, inputs: Inputs, arrived: Any, counted: Any = None, read: Any = None) -> dict[str, Any]:
+        """Returns `info`, and keeps the belief; see `LoopState.report` and `actions_of`."""
+        report = self._now.report(inputs, arrived, counted)
+        self._belief = report.belief
+        return loop_info(report, self.loop, actions_of(inputs, self.plant, read))
+
 
 class LoopState(CopiedWhole, ABC):
     """Where a loop is, or where N are; the last axis of every array is then the loop.
@@ -250,7 +258,7 @@ class LoopState(CopiedWhole, ABC):
             cost = (np.maximum.reduce(worst) > 0.0).astype(np.float64)
             values = values.copy() if values is worst else values
             age, damaged, outside = (frozen(each.copy()) for each in (age, damaged, outside))
-            for array in (estimate, number, alarm):
+            for array in (estimate, number, alarm, self.moves):
                 frozen(array)
             if self.requests is None:
                 asked = forced = self.nothing

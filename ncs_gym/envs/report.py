@@ -9,6 +9,7 @@ import numpy as np
 
 from ncs_gym.estimation.error_table import ErrorTable
 from ncs_gym.network.channel import Channel
+from ncs_gym.validation import frozen
 
 
 class Belief(NamedTuple):
@@ -41,6 +42,12 @@ class Belief(NamedTuple):
     committed: np.ndarray
     moves: Any = 0
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Belief:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _loaded_belief, tuple(self)
+
     @property
     def stays(self) -> Any:
         """Whether an error in a certified set is known to stay there while the contract is kept, of one loop or N."""
@@ -54,6 +61,10 @@ class Belief(NamedTuple):
         if self.estimate.ndim == 1:
             return self.table.shape(self.number)
         return self.table.shapes.take(self.number, axis=0)
+
+
+def _loaded_belief(*values: Any) -> Belief:
+    return Belief._make(frozen(each) if isinstance(each, np.ndarray) else each for each in values)
 
 
 class Beginning(NamedTuple):

@@ -12,13 +12,12 @@ from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.autoreset import Autoreset, Begun, Moved
 from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv
-from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import GuardedLoop, ManyLoops, with_columns
 from ncs_gym.envs.loop_settings import CHANNELS, vector_reset_options
-from ncs_gym.envs.spaces import Observer, actions_of, read_actions
+from ncs_gym.envs.spaces import Observer, read_actions
 from ncs_gym.network.channel import Channel, widest
-from ncs_gym.network.downlink import Inputs, no_inputs
+from ncs_gym.network.downlink import no_inputs
 from ncs_gym.network.requests import require_on_request
 from ncs_gym.rendering import PacketRecord
 from ncs_gym.tasks.base_task import Task
@@ -141,10 +140,10 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         super().reset(seed=seed)
         if seed is not None:
             self._now.process.forget()
-        if not (self._consistent or mask.all()):
-            raise gym.error.ResetNeeded("reset all environments first")
         chosen = np.flatnonzero(mask).tolist()
         sources = self._now.drawn(sources, self.np_random, chosen)
+        if not (self._consistent or mask.all()):
+            raise gym.error.ResetNeeded("reset all environments first")
         self._consistent = False
         self._now.give(sources, chosen)
         observation, info = self._begin(mask, starts, fixed)
@@ -181,7 +180,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         u = u if guard is None else guard.input(u)
         inputs, arrived = now.move(self.np_random, u, self._move_task)
         reward = self._task.reward_many(self.plant, self._task_state, now.state, inputs.applied)
-        info = self._info(inputs, arrived, None)
+        info = self._info(inputs, arrived)
         if guard is not None:
             guard.observe(self._belief)
             info |= guard.info()
@@ -288,9 +287,3 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         for u in self._now.pending:
             task_state = self._task.predict_many(self.plant, task_state, u)
         return self._observer.observation(self._belief, self._task.observe_many(task_state)).T
-
-    def _info(self, inputs: Inputs, arrived: np.ndarray, counted: np.ndarray | None) -> dict[str, Any]:
-        """Returns the infos; the costs of environments that are not `counted`, shape (N,), do not count once more."""
-        report = self._now.report(inputs, arrived, counted)
-        self._belief = report.belief
-        return loop_info(report, self.loop, actions_of(inputs, self.plant))

@@ -7,6 +7,7 @@ for tens of milliseconds at a time, and would take several times the memory.
 from __future__ import annotations
 
 from hashlib import blake2b
+from typing import Any
 
 import numpy as np
 
@@ -66,6 +67,9 @@ class ErrorTable:
 
     def __len__(self) -> int:
         return self._count
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ErrorTable:
+        return self  # shared by all estimators, as the graph that it belongs to
 
     @property
     def bytes_each(self) -> int:

@@ -27,16 +27,16 @@ from shields.runtime.safety_filter import NumberedErrors, SafetyFilter
 from shields.runtime.set_test import PredictedErrors, norms
 from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
 
-# Why states are not proved safe, by code.
-REASONS = np.array(EXPLANATIONS, dtype=object)
+# By code, for the codes of many loops.
+_EXPLANATIONS = np.array(EXPLANATIONS, dtype=object)
 
 
 class Guard(CopiedWhole, ABC):
     """Decides the inputs of a loop and follows whether they prove that its state stays in S, or in the box.
 
     It stands inside the loop, where nothing comes between what is decided and what is applied, and knows what a
-    controller can know. Every step is one `input` and one `observe`. Its claim asks that the loop moved one step in
-    between, and that the input applied is the one that was due, whatever moved it.
+    controller can know. Every step is one `input` and one `observe`. Its claim asks that one input was decided and the
+    loop moved one step between two observations, and that the input applied is the one that was due.
 
     Args:
         safety_filter: Makes the decisions.
@@ -47,7 +47,7 @@ class Guard(CopiedWhole, ABC):
     Attributes:
         filter: The same.
         input_delay: c, the number of steps from a decision to its effect.
-        on_unproved: The same.
+        lost: Says that states are not proved safe.
         penalty: Subtracted from the reward per intervention.
         belief: What was observed last.
         errors: What follows from the error shape of its estimate.
@@ -58,10 +58,9 @@ class Guard(CopiedWhole, ABC):
     ) -> None:
         m = safety_filter.plant.m
         self.filter, self.input_delay = safety_filter, downlink.input_delay
-        self.on_unproved, self.penalty = on_unproved, 0.0
+        self.lost, self.penalty = LostGuarantee(on_unproved, size or 1), 0.0
         self._monitor = GuaranteeMonitor(safety_filter, downlink)
         self._errors_of = NumberedErrors(safety_filter)
-        self._lost = LostGuarantee(on_unproved, size or 1)
         self._schedule = None
         if downlink.channel is not None:
             self._schedule = CommittedInputs(self.input_delay, m if size is None else (m, size))
@@ -74,8 +73,9 @@ class Guard(CopiedWhole, ABC):
     _proposed: np.ndarray
     _stored: np.ndarray
     _state: MonitorState
-    # The clock of the loop when it was observed last.
+    # The clock of the loop when it was observed last, and how many inputs were decided since.
     _moves: Any
+    _asked = 0
 
     def observe(self, belief: Belief) -> None:
         """Takes in what is known after the step that followed the decision."""
@@ -85,7 +85,8 @@ class Guard(CopiedWhole, ABC):
         else:
             on_time = _equal(belief.applied, schedule.due(decided))
             same_input = _equal(belief.committed, decided)
-        moved_once, self._moves = belief.moves == self._moves + 1, belief.moves
+        moved_once = (belief.moves == self._moves + 1) & (self._asked == 1)
+        self._moves, self._asked = belief.moves, 0
         self._drop(moved_once & same_input & on_time)
         self._take(belief)
         happened = self._decision, moved_once, same_input, belief, self.errors, on_time
@@ -100,7 +101,7 @@ class Guard(CopiedWhole, ABC):
 
     def tell(self) -> None:
         """Says what is new; see `LostGuarantee`."""
-        self._lost.tell()
+        self.lost.tell()
 
     def _take(self, belief: Belief) -> None:
         self.belief, self.errors = belief, self._errors_of.of(belief.table, belief.number)
@@ -123,7 +124,7 @@ class Guard(CopiedWhole, ABC):
 class OneGuard(Guard):
     """The guard of one loop."""
 
-    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol, on_unproved: str = "warn") -> None:
+    def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol, on_unproved: str) -> None:
         super().__init__(safety_filter, downlink, on_unproved)
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
@@ -137,7 +138,7 @@ class OneGuard(Guard):
             self._start, self._known = start, starts_known(self.filter, start, self.input_delay)
         self.look_at(channels)
         self.start(belief, self._known, earlier)
-        self._lost.begin()
+        self.lost.begin()
         self._interventions = self._proved = self._count = 0
         margin = self.filter.margin(belief.estimate, self.errors, self._idle)
         self._decision, self._proposed = Decision(self._idle, False, False, False, margin, ""), self._idle
@@ -161,7 +162,7 @@ class OneGuard(Guard):
             pending: The inputs decided for the next c steps, none of them at the start of an episode.
         """
         self._take(belief)
-        self._moves = belief.moves
+        self._moves, self._asked = belief.moves, 0
         self._stored, is_safe = first_store(self.filter, belief.estimate, self.errors, known[-1])
         self._state = self._monitor.start(is_safe, belief, self.errors, is_first=is_first)
         if self._schedule is not None:
@@ -177,7 +178,7 @@ class OneGuard(Guard):
     def decide(self, proposed: np.ndarray) -> Decision:
         """Returns the decision about a proposed input, shape (m,), at the belief observed last; never raises."""
         decision = self.filter.decide(self.belief.estimate, self.errors, proposed, self._stored)
-        self._decision, self._proposed = decision, proposed
+        self._decision, self._proposed, self._asked = decision, proposed, self._asked + 1
         self._stored = decision.plan.copy() if len(decision.plan) else decision.plan
         return decision
 
@@ -208,7 +209,7 @@ class OneGuard(Guard):
         self._proved += not reason
         self._interventions += decision.intervened
         if reason:
-            self._lost.note_of(reason)
+            self.lost.note_of(reason)
         ahead = {"shield_plan_length": self.plan_length} if self.filter.mode == "lookahead" else {}
         return ahead | {
             "shield_intervened": decision.intervened,
@@ -268,7 +269,7 @@ class ManyGuards(Guard):
         belief, starts, earlier, channels = beginning
         chosen, none = np.flatnonzero(mask), self._none
         self.look_at(channels)
-        self._lost.begin(mask)
+        self.lost.begin(mask)
         self._take(belief)
         known = [self._drawn] * self._size
         for e in np.flatnonzero(mask & ~np.isnan(starts[:, 0])).tolist():
@@ -280,8 +281,8 @@ class ManyGuards(Guard):
                 estimate, errors = belief.estimate[:, e].copy(), self.errors.single(e)
                 plan, is_safe[e] = first_store(self.filter, estimate, errors, known[e][-1])
                 self._stored[: len(plan), :, e] = plan
-        self._leave(~mask & (belief.moves != self._moves))
-        self._moves = belief.moves
+        self._leave(~mask & ((belief.moves != self._moves) | (self._asked > 0)))
+        self._moves, self._asked = belief.moves, 0
         started = self._monitor.start(is_safe, belief, self.errors)
         self._state = MonitorState(*(np.where(mask, *both) for both in zip(started, self._state, strict=True)))
         if self._schedule is not None:
@@ -308,7 +309,7 @@ class ManyGuards(Guard):
         """Returns the inputs to apply in place of proposed ones, shape (m, N)."""
         decided = self.filter.decide_columns(self.belief.estimate, self.errors, u, self._stored)
         self._decision, self._proposed, self._counted = decided, u, ~self._none
-        self._stored = decided.plan.copy()
+        self._stored, self._asked = decided.plan.copy(), self._asked + 1
         return decided.input
 
     @property
@@ -325,7 +326,7 @@ class ManyGuards(Guard):
         self._interventions = self._interventions + decided.intervened
         doubted = np.count_nonzero(reasons) > 0
         if doubted:
-            self._lost.note(reasons, np.arange(self._size))
+            self.lost.note(reasons, np.arange(self._size))
         ahead = {}
         if len(self._stored):
             ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(self._stored[:, 0]), axis=0)
@@ -335,7 +336,7 @@ class ManyGuards(Guard):
             "shield_correction": norms(decided.input - proposed),
             "shield_margin": decided.margin.copy(),
             "shield_guaranteed": is_proved,
-            "shield_reason": REASONS[reasons] if doubted else self._no_reason,
+            "shield_reason": _EXPLANATIONS[reasons] if doubted else self._no_reason,
             "episode_interventions": self._interventions.copy(),
             "episode_guaranteed": self._proved / self._count,
         }

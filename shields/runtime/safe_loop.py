@@ -40,7 +40,6 @@ from shields.runtime.guarantee import (
     OTHER_EPISODE,
     OTHER_INPUT,
     UNKNOWN_START,
-    LostGuarantee,
 )
 from shields.runtime.guard import OneGuard
 from shields.runtime.safety_filter import SafetyFilter
@@ -143,12 +142,11 @@ class SafeLoop(CopiedWhole):
         self._filter = SafetyFilter(certificate, plant, mode, horizon)
         if not isinstance(channel, Channel):
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
-        self._lost = LostGuarantee(on_unproved)
         self._contract = certificate.contract
         histories = arrival_histories(plant, channel, self._contract, coarsens=True)
         self._estimator = Estimator(plant, channel, histories=histories)
         protocol = downlink_protocol(downlink, downlink_contract)
-        self._guard, self._decided = OneGuard(self._filter, protocol), np.zeros(plant.m)
+        self._guard, self._decided = OneGuard(self._filter, protocol, on_unproved), np.zeros(plant.m)
         self._input_delay = protocol.input_delay
         warn_of_broken_contract(self._contract, channel, self._input_delay, counts_losses=True)
         self._inputs = CommittedInputs(self._input_delay, plant.m)
@@ -231,8 +229,8 @@ class SafeLoop(CopiedWhole):
         self._unknown = None if known else ()
         self._begin(inside)
         self._phase = _Phase.STARTED
-        self._lost.begin()
-        self._lost.tell_of(self.reason)
+        self._guard.lost.begin()
+        self._guard.lost.tell_of(self.reason)
 
     @np.errstate(all="ignore")
     def receive(self, packets: Iterable[Packet] = (), applied: Any = None, echoes: Iterable[Echo] = ()) -> np.ndarray:
@@ -294,7 +292,7 @@ class SafeLoop(CopiedWhole):
         estimate = self.estimate
         if self._discarded != before:
             self._tell_of_discarded(before)
-        self._lost.tell_of(self.reason)
+        self._guard.lost.tell_of(self.reason)
         return estimate
 
     @np.errstate(all="ignore")

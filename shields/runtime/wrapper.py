@@ -25,7 +25,7 @@ class _Shield(RecordConstructorArgs):
     filter: SafetyFilter = setting("filter", "_guard.filter")
     mode: str = setting("mode", "_guard.filter.mode")
     horizon: int | None = setting("horizon", "_guard.filter.horizon")
-    on_unproved: str = setting("on_unproved", "_guard.on_unproved")
+    on_unproved: str = setting("on_unproved", "_guard.lost.on_unproved")
     channel: Channel = setting("channel", "_inner.channel")
 
     env: Any
@@ -83,8 +83,8 @@ class _Shield(RecordConstructorArgs):
                 f"its estimator keeps other error sets: give it contract={promised}",
                 BrokenContractWarning,
             )
-        inner.install(self._guard)
         self._wrapper.__init__(self, env)
+        inner.install(self._guard)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts episodes; see the environment's.

@@ -180,7 +180,7 @@ class LoopBeside:
             made = self.shield.filter
             given = self.shield.certificate, env.plant, channel, made.mode, made.horizon
             self.loops[channel] = safe_loop(*given, **behind)
-        self.loop, estimator = self.loops[channel], env.estimator
+        self.loop, estimator = self.loops[channel], env._now.estimator
         vars(estimator).pop("advance", None)
         advance = estimator.advance
 

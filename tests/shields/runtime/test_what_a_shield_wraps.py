@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +20,7 @@ from tests.product import loop_env, safety_shield, vector_env, vector_shield
 PLANT = truck_trailer(mass=4000.0)
 CERTIFICATE = certificate_of(PLANT)
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
+COPIES = copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))
 
 
 def scalar(**settings):
@@ -182,6 +184,67 @@ def test_another_input_than_the_one_decided_is_seen(made, monkeypatch):
     assert np.all(shield.reset()[1]["shield_guaranteed"])
 
 
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
+@pytest.mark.parametrize("made", [scalar, vector])
+def test_an_input_that_is_decided_and_not_applied_ends_the_claim(made, mode):
+    shield = made(mode=mode, on_unproved="ignore")
+    env, action = shield.unwrapped, np.zeros(shield.action_space.shape)
+    shield.reset(seed=0)
+    env.guard.input(np.zeros(np.shape(env.belief.applied)))
+    for _ in range(2):
+        assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_STEPS)
+    assert np.all(shield.reset()[1]["shield_guaranteed"])
+    assert np.all(shield.step(action)[-1]["shield_guaranteed"])
+    u = env.guard.input(np.zeros(np.shape(env.belief.applied)))
+    env._now.move(env.np_random, u, env._move_task)
+    assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_STEPS)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_an_input_without_its_step_ends_the_claim_also_where_others_begin(moves):
+    shield = vector(on_unproved="ignore")
+    env = shield.unwrapped
+    shield.reset(seed=0)
+    u = env.guard.input(np.zeros((1, 2)))
+    if moves:
+        env._now.move(env.np_random, u, env._move_task)
+    info = shield.reset(options={"reset_mask": np.array([True, False])})[1]
+    assert info["shield_reason"].tolist() == ["", OTHER_STEPS]
+    info = shield.step(np.zeros((2, 1)))[-1]
+    assert info["shield_reason"].tolist() == ["", OTHER_STEPS]
+
+
+def test_a_step_that_fails_inside_a_partial_reset_is_no_episode_that_goes_on(monkeypatch):
+    shield = vector()
+    env, move = shield.unwrapped, shield.unwrapped._now.move
+
+    def drawn(rng):
+        with monkeypatch.context() as patch:
+            patch.setattr(env._now, "move", lambda *given: (move(*given), 1 / 0))
+            with pytest.raises(ZeroDivisionError):
+                env.step(np.ones((2, 1)))
+        return env.channel
+
+    shield.reset(seed=0)
+    with pytest.raises(gym.error.ResetNeeded):
+        shield.reset(options={"reset_mask": np.array([True, False]), "channel": drawn})
+
+
+@pytest.mark.parametrize("copied", [lambda env: env, copy.copy, *COPIES])
+@pytest.mark.parametrize("made", [scalar, vector])
+def test_nobody_writes_into_what_a_guard_decides_from(made, copied):
+    shield = made()
+    shield.reset(seed=0)
+    shield.step(np.ones(shield.action_space.shape))
+    env = copied(shield).unwrapped
+    assert not hasattr(env, "estimator")
+    for belief in (env.belief, env.guard.belief, copied(env.belief)):
+        arrays = [each for each in belief if isinstance(each, np.ndarray)]
+        assert len(arrays) == (9 if made is vector else 3)
+        assert not any(each.flags.writeable for each in arrays)
+    assert env.belief.table is env.guard.belief.table is env._now.estimator.table
+
+
 @pytest.mark.parametrize("made", [scalar, vector])
 def test_another_environment_in_place_of_the_wrapped_one_is_said_at_the_next_reset(made):
     shield, other = made(), made().env
@@ -196,13 +259,15 @@ def test_a_shield_that_is_refused_leaves_the_environment_bare():
     for wrong in ({"mode": "hope"}, {"penalty": -1.0}, {"on_unproved": "log"}, {"certificate": "missing.json"}):
         with pytest.raises(ValueError, match=r".+"):
             safety_shield(env, **({"certificate": CERTIFICATE} | wrong))
+    with pytest.raises(TypeError, match="Expected env"):
+        safety_shield(SimpleNamespace(unwrapped=env), CERTIFICATE)
     assert env.guard is None
     shield = safety_shield(env, CERTIFICATE)
     assert env.guard is shield.unwrapped.guard is not None
 
 
 @pytest.mark.cases(5)
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("copied", COPIES)
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 @pytest.mark.parametrize("made", [scalar, vector])
 def test_a_copy_goes_on_alike_with_a_guard_of_its_own(made, mode, copied):
