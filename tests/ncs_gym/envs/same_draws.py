@@ -93,7 +93,7 @@ class ScriptedEnv(NCSEnv):
         self._now.process = ScriptedProcess(self.plant, self.disturbance, self.allow_assumption_violation)
         if (parameters := many._now.process.process.parameters) is not None:
             self._now.process.process.choose(np.random.default_rng(0), None, parameters[index])
-        self.estimator.reset(many._now.estimator.mean[:, index])
+        self._now.estimator.reset(many._now.estimator.mean[:, index])
         self._task_state = np.copy(many._task_state[..., index])[()]
         self._now.memory = np.copy(many._now.memory[..., index])[()]
         self._now.network = ChannelState(self.episode_channel, np.random.default_rng(0))

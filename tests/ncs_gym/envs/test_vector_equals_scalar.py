@@ -264,7 +264,7 @@ def test_graphs_that_nobody_uses_any_more_are_freed(monkeypatch):
         graphs.add(env._now.estimator.histories)
     gc.collect()
     assert len(graphs) <= 3
-    assert env.single.estimator._histories is not env._now.estimator.histories
+    assert env.single._now.estimator._histories is not env._now.estimator.histories
 
 
 def test_graphs_of_many_plants_are_not_kept_for_ever(monkeypatch):
