@@ -9,8 +9,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
+from ncs_gym.envs.guarded_loop import GuardedLoop
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.loop import GuardedLoop, Loop, OneLoop
+from ncs_gym.envs.loop import Loop, OneLoop
 from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
 from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
 from ncs_gym.network.channel import Channel

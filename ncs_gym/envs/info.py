@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ncs_gym.envs.loop import Loop
 from ncs_gym.envs.report import Report
-
-if TYPE_CHECKING:
-    from ncs_gym.envs.loop import Loop
 
 # What is a number in the info of one environment, and of many an array that the environments go on using.
 SHARED = (

@@ -12,8 +12,9 @@ from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.autoreset import Autoreset, Begun, Moved
 from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv
+from ncs_gym.envs.guarded_loop import GuardedLoop
 from ncs_gym.envs.json_settings import SpecOfJson
-from ncs_gym.envs.loop import GuardedLoop, ManyLoops, with_columns
+from ncs_gym.envs.loop import ManyLoops, with_columns
 from ncs_gym.envs.loop_settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, read_actions
 from ncs_gym.network.channel import Channel, widest
