@@ -41,7 +41,7 @@ LAYERS = {
         {"errors", "atomic_write", "certificate_text"},
         {"json_documents", "polytope"},
         {"certificate"},
-        {"verification", "paper", "synthesis", "reach"},
+        {"verification", "paper", "synthesis"},
         {"packaged_certificates"},
         {"runtime"},
         {"silence", "held", "export"},
