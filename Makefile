@@ -88,10 +88,11 @@ test-slow-part: $(INSTALLED) ## a fixed part of the long tests
 mutants: $(INSTALLED) ## sixty small faults, and the test that notices each
 	$(BIN)/python -m benchmarks.project mutants
 
-lint: $(INSTALLED) ## style and declared dependencies
+lint: $(INSTALLED) ## style, declared dependencies, and who imports whom
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/deptry $(PACKAGES)
+	$(BIN)/lint-imports --no-cache
 
 types: $(INSTALLED) ## types
 	$(BIN)/pyright --pythonpath $(BIN)/python

@@ -54,7 +54,7 @@ from ncs_gym import (
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, histories_of
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
-from ncs_gym.network import CommittedInputs
+from ncs_gym.network.actuator import CommittedInputs
 from ncs_gym.registration import registered_ids
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Certificate, Infeasible, SafetyShield, VectorSafetyShield, certificate_for, synthesize

@@ -28,8 +28,9 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.resting_point import MovedOperatingPointWarning
 from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
-from ncs_gym.processes import FamilyProcess, FunctionProcess, GymProcess, LinearProcess, Process, linear_model
-from ncs_gym.processes.linearization import NoEquilibriumWarning
+from ncs_gym.processes.gym_process import GymProcess
+from ncs_gym.processes.linearization import NoEquilibriumWarning, linear_model
+from ncs_gym.processes.process import FamilyProcess, FunctionProcess, LinearProcess, Process
 from ncs_gym.recording import RecordedBounds, bounds_from_recording
 from ncs_gym.registration import register_all, register_plant
 from ncs_gym.rendering import Annotation

@@ -25,15 +25,10 @@ from ncs_gym.plants.lane_keeping import lane_keeping
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.plants.truck_trailer import truck_trailer
-from ncs_gym.processes import (
-    CartPoleProcess,
-    InvertedPendulumProcess,
-    PendulumProcess,
-    Process,
-    inverted_pendulum,
-    nonlinear_cart_pole,
-    pendulum,
-)
+from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_pole
+from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
+from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess, inverted_pendulum
+from ncs_gym.processes.process import Process
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking

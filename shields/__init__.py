@@ -9,15 +9,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from shields.certificate import Certificate, Multipliers, Proof, Updates
+from shields.certificate_text import Reach
 from shields.errors import CertificateError, GuaranteeLostError, GuaranteeLostWarning, Infeasible
 from shields.packaged_certificates import certificate_for
 from shields.polytope import Polytope
-from shields.reach import Reach, reach_of
 from shields.runtime import Decision, SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield
 from shields.verification import Condition, Report, verify
 
 if TYPE_CHECKING:
-    from shields.held import SetPoints, setpoint_range
+    from shields.held import SetPoints, reach_of, setpoint_range
     from shields.silence import Silence, silence_of
     from shields.synthesis import (
         Requirements,
@@ -63,7 +63,7 @@ __all__ = [
 # Imported at first use: these need the solver.
 _NAMES = {
     "synthesis": ("Requirements", "certify", "requirements", "synthesize"),
-    "held": ("SetPoints", "setpoint_range"),
+    "held": ("SetPoints", "reach_of", "setpoint_range"),
     "silence": ("Silence", "silence_of"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}

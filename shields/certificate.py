@@ -230,10 +230,10 @@ class Certificate(ReadOnlyArrays):
             as_matrix(Sigma, (n, n), "Sigma")
         if len({proof.shares is None for proof in self.proofs}) > 1:
             raise ValueError("either all of its proofs have multipliers of (I), or none has")
-        if self.polytope is None and not self.keeps_ellipsoid:
-            raise ValueError("its proofs have no multipliers of (I), and it has no polytope")
-        around = self.resting_state if self.polytope is None else self.polytope.center
-        if len(around) == n and not np.array_equal(around, self.resting_state):
+        if self.polytope is None:
+            if not self.keeps_ellipsoid:
+                raise ValueError("its proofs have no multipliers of (I), and it has no polytope")
+        elif self.polytope.dim == n and not np.array_equal(self.polytope.center, self.resting_state):
             raise ValueError("its polytope must be around its resting state")
 
     @cached_property

@@ -3,15 +3,58 @@
 from __future__ import annotations
 
 import textwrap
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ncs_gym import ChannelContract
+import numpy as np
+
+from ncs_gym import ChannelContract, LinearPlant
+from ncs_gym.plants.description import row_limit
 from ncs_gym.validation import counted, printable
 
 if TYPE_CHECKING:
     from shields.certificate import Certificate
 
 _WIDTH, _INDENT = 80, 14
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far a limited quantity gets inside the safe set, in percent of the way from the operating point to its ends.
+
+    It is a number of a solver, for planning: nothing is proved with it.
+
+    Attributes:
+        limit: The limit in words, as `print(plant)` says it.
+        low, high: Percent of the way to the low and to the high end, None for an end that is open; negative where the
+            set does not get to the operating point.
+    """
+
+    limit: str
+    low: float | None
+    high: float | None
+
+    def __str__(self) -> str:
+        ends = [f"{0.0 + round(each, 2):.4g} %" for each in (self.low, self.high) if each is not None]
+        return f"{' and '.join(dict.fromkeys(ends))} of {self.limit}"
+
+
+def reach_in(safe_set: Any, plant: LinearPlant) -> tuple[Reach, ...]:
+    """Returns what `shields.reach_of` does, of any set inside the safe box.
+
+    Raises:
+        ValueError: If a solver fails.
+    """
+
+    def percent(row: np.ndarray, end: float) -> float | None:
+        if not np.isfinite(end):
+            return None
+        return 100.0 * float(safe_set.support(np.sign(end) * row)) / abs(end)
+
+    return tuple(
+        Reach(row_limit(plant, j), *(percent(plant.box[j], end) for end in plant.box_ends[:, j].tolist()))
+        for j in np.flatnonzero(~plant.is_past_row).tolist()
+    )
 
 
 def size_of(certificate: Certificate) -> str:

@@ -13,12 +13,12 @@ import numpy as np
 from ncs_gym import LinearPlant
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_vector, counted, shown
 from shields.certificate import Certificate
-from shields.certificate_text import labeled
-from shields.reach import reach_of
+from shields.certificate_text import Reach, labeled, reach_in
 from shields.runtime import SafetyFilter
 from shields.runtime.safety_filter import MARGIN
 from shields.synthesis.resting_point import equilibria
 from shields.synthesis.semidefinite_programs import extreme_points
+from shields.verification import require_valid
 
 # Set points keep this much from what the filter lets pass, in units of its rows: more than a solver is off.
 _KEPT = 1e-6
@@ -88,6 +88,21 @@ def setpoint_range(certificate: Certificate, plant: LinearPlant, output: Any, ag
     states, inputs = np.split(points, [n], axis=1)
     low, high = (states @ row + row @ plant.operating_state).tolist()
     return SetPoints(age=age, low=low, high=high, deviations=states @ row, states=states, inputs=inputs)
+
+
+def reach_of(certificate: Certificate, plant: LinearPlant) -> tuple[Reach, ...]:
+    """Returns how far each quantity that the safe box limits gets inside the safe set, by its support along the row.
+
+    Args:
+        certificate: Verified exactly here.
+        plant: The plant it was made for.
+
+    Raises:
+        CertificateError: If the certificate does not verify for the plant.
+        ValueError: If an argument is of another kind, or a solver fails.
+    """
+    require_valid(certificate, plant)
+    return reach_in(certificate.safe_set, plant)
 
 
 def held_text(certificate: Certificate, plant: LinearPlant, input_delay: int = 0) -> str:

@@ -47,7 +47,9 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.envs.loop import Loop
-from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
+from ncs_gym.processes.cart_pole_process import CartPoleProcess
+from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
+from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
 from ncs_gym.registration import TRUCK_TRAILER
 from ncs_gym.rendering.episode_record import Annotation
 from ncs_gym.uncertainty.disturbances import as_disturbance

@@ -76,15 +76,12 @@ def channel(settings: ChannelSettings) -> None:
         )
     log = PacketLog.load(settings.file)
     dt = given or log.period
-    asked = [] if contract is None else [contract.max_age]
-    if contract is not None and silence:
-        asked.append(contract.max_age + silence.anywhere)
+    extra = [0, silence.anywhere] if silence else [0]
+    asked = [] if contract is None else [contract.max_age + each for each in extra]
     found = _numbers(log, dt, asked)
     print(_text(log, found))
     whose = "certificate" if settings.certificate else "environment"
-    if certificate is not None and contract is None:
-        print(f"The {whose} needs no contract: it holds through any silence.")
-    elif contract is not None:
+    if contract is not None:
         row = _row(found, contract.max_age)
         share = f", in {100.0 * row['broken']:.3g} % of steps" if row["times"] else ""
         newest = f"a newest sample of at most {counted(contract.max_age, 'step')}"
@@ -96,6 +93,8 @@ def channel(settings: ChannelSettings) -> None:
                     "ahead: see the row with so many less."
                 )
             )
+    elif certificate is not None:
+        print(f"The {whose} needs no contract: it holds through any silence.")
     if len(asked) > 1:
         print(
             wrapped(

@@ -14,10 +14,9 @@ from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import Loop, OneLoop
 from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
 from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
-from ncs_gym.network.channel import Channel
+from ncs_gym.network.channel import Channel, require_on_request
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import no_inputs
-from ncs_gym.network.requests import require_on_request
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Renderer, sent_at

@@ -16,7 +16,10 @@ from gymnasium.envs.registration import EnvSpec
 from ncs_gym.network.channel import Channel, GilbertElliott, TraceChannel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes import CartPoleProcess, FamilyProcess, InvertedPendulumProcess, LinearProcess, PendulumProcess
+from ncs_gym.processes.cart_pole_process import CartPoleProcess
+from ncs_gym.processes.gym_pendulum import PendulumProcess
+from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
+from ncs_gym.processes.process import FamilyProcess, LinearProcess
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking

@@ -17,10 +17,8 @@ from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import ManyLoops, with_columns
 from ncs_gym.envs.loop_settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, read_actions
-from ncs_gym.network.channel import Channel, widest
+from ncs_gym.network.channel import Channel, require_on_request, widest
 from ncs_gym.network.downlink import no_inputs
-from ncs_gym.network.requests import require_on_request
-from ncs_gym.rendering import PacketRecord
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.validation import as_count, setting, shown
 
@@ -253,7 +251,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         elif moved:
             step = int(self.steps[e])
             sends, arrival = self._now.network.arrival_of(e, step)
-            renderer.record(own, task_state, PacketRecord(step, arrival) if sends else None, note)
+            renderer.record(own, task_state, (step, arrival) if sends else None, note)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Closes the process."""

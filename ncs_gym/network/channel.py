@@ -227,6 +227,17 @@ def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
     return float(1.0 - 1.0 / packets)
 
 
+def require_on_request(requests: Any) -> Any:
+    """Returns the requests of a channel that takes samples on request.
+
+    Raises:
+        ValueError: If there are none: then samples are sent periodically.
+    """
+    if requests is None:
+        raise ValueError("the channel sends samples by itself: make it with Channel(..., on_request=True)")
+    return requests
+
+
 def require_duration(channel: Channel, dt: float) -> None:
     """Raises ValueError if a channel replays a record in steps of another duration than dt [s]."""
     if isinstance(channel, TraceChannel) and channel.dt is not None and not isclose(channel.dt, dt, rel_tol=1e-6):

@@ -144,14 +144,3 @@ class Requests:
         Shape (c+1,) or (c+1, N); the first is the one that is due.
         """
         return self._flags[self._input_delay :: -1]
-
-
-def require_on_request(requests: Requests | None) -> Requests:
-    """Returns the requests of a channel that takes samples on request.
-
-    Raises:
-        ValueError: If there are none: then samples are sent periodically.
-    """
-    if requests is None:
-        raise ValueError("the channel sends samples by itself: make it with Channel(..., on_request=True)")
-    return requests

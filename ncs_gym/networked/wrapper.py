@@ -13,9 +13,9 @@ from gymnasium.utils import RecordConstructorArgs, seeding
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos
-from ncs_gym.network.channel import Channel
+from ncs_gym.network.channel import Channel, require_on_request
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.network.requests import Requests, require_on_request
+from ncs_gym.network.requests import Requests
 from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.uncertainty.family import Family
 from ncs_gym.validation import as_flag, as_setting, shown
 
 
@@ -154,7 +153,7 @@ class _Members(Process):
 
     vectorized = True
 
-    def __init__(self, plant: LinearPlant, family: Family, size: int | None) -> None:
+    def __init__(self, plant: LinearPlant, family: Any, size: int | None) -> None:
         self._family, self._size = family, size
         count = 1 if size is None else size
         self._matrices = np.tile(np.column_stack([plant.A, plant.B, np.zeros(plant.n)]), (count, 1, 1))

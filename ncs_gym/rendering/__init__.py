@@ -4,7 +4,7 @@ An environment with a render mode records every step with a `Renderer` and asks 
 knows with an `Annotation`. pygame is imported when the first frame is drawn, not before.
 """
 
-from ncs_gym.rendering.episode_record import Annotation, PacketRecord, sent_at
+from ncs_gym.rendering.episode_record import Annotation, sent_at
 from ncs_gym.rendering.renderer import Renderer
 
-__all__ = ["Annotation", "PacketRecord", "Renderer", "sent_at"]
+__all__ = ["Annotation", "Renderer", "sent_at"]

@@ -101,13 +101,13 @@ class EpisodeRecord:
         self._store(info, task_state, note)
 
     def add(
-        self, info: Mapping[str, Any], task_state: Any, sent: PacketRecord | None, note: Annotation | None = None
+        self, info: Mapping[str, Any], task_state: Any, sent: tuple[int, Any] | None, note: Annotation | None = None
     ) -> None:
         """Adds a step, with its info and what became of its sample; None where none is sent."""
         self.step += 1
         self._store(info, task_state, note)
         if sent is not None:
-            self.packets.append(sent)
+            self.packets.append(PacketRecord(*sent))
 
     def _store(self, info: Mapping[str, Any], task_state: Any, note: Annotation | None) -> None:
         self.info, self._task_state = deepcopy(dict(info)), task_state
@@ -141,9 +141,9 @@ class EpisodeRecord:
         return TrackedOutput(name, unit, *(task.output @ plant.operating_state + np.array(numbers)).tolist())
 
 
-def sent_at(step: int, network: ChannelState, arrived: list[Packet]) -> PacketRecord | None:
+def sent_at(step: int, network: ChannelState, arrived: list[Packet]) -> tuple[int, Any] | None:
     """Returns what became of the sample of a step, after the exchange of that step; None if none was sent."""
     if not network.sends_at(step):
         return None
     arrivals = {step: arrived} | network.in_flight
-    return PacketRecord(step, next((k for k, packets in arrivals.items() if step in {p.stamp for p in packets}), None))
+    return step, next((k for k, packets in arrivals.items() if step in {p.stamp for p in packets}), None)

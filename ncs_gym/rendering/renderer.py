@@ -11,7 +11,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
 from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.drawings import drawing_of
-from ncs_gym.rendering.episode_record import Annotation, EpisodeRecord, PacketRecord
+from ncs_gym.rendering.episode_record import Annotation, EpisodeRecord
 from ncs_gym.rendering.panel import draw_header, draw_panel
 from ncs_gym.rendering.phase_plane import PhasePlane
 from ncs_gym.tasks.base_task import Task
@@ -46,7 +46,7 @@ class Renderer:
         self._show()
 
     def record(
-        self, info: Mapping[str, Any], task_state: Any, sent: PacketRecord | None, note: Annotation | None = None
+        self, info: Mapping[str, Any], task_state: Any, sent: tuple[int, Any] | None, note: Annotation | None = None
     ) -> None:
         """Adds a step, with its info, the state of the task after it, its sample (None where none is sent)."""
         self.episode.add(info, task_state, sent, note)

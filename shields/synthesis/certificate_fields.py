@@ -13,8 +13,8 @@ from ncs_gym import Ellipsoid, ErrorSet, LinearPlant, exact
 from ncs_gym.estimation.error_sets import ErrorSetsByAge
 from ncs_gym.plants.hard_bounds import inflated
 from shields.certificate import Certificate, Proof, Updates
+from shields.certificate_text import reach_in
 from shields.polytope import Polytope
-from shields.reach import reach_in
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
 from shields.synthesis.multipliers import with_best_multipliers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid

@@ -66,7 +66,7 @@ def synthesize(
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
     if not (safe_set is None or (isinstance(safe_set, str) and safe_set in ("ellipsoid", "polytope"))):
         raise ValueError(f"safe_set must be 'polytope', 'ellipsoid' or None, got {shown(safe_set)}")
-    if contract is not None and not isinstance(contract, ChannelContract):
+    if not isinstance(contract, ChannelContract | None):
         raise ValueError(
             "contract must be ChannelContract(max_age=...), or contract_of(channel) for a Channel that keeps one, or "
             f"None, got {shown(contract)}"

@@ -91,7 +91,7 @@ def _closed_loop_conditions(certificate: Certificate, plant: LinearPlant) -> Ite
             if certificate.keeps_ellipsoid:  # symmetric limits
                 on_ellipsoid = 1 - least - root_above(quadratic([image], L))
                 yield scalar_condition(f"(B) |c x| + rho <= 1 - eta on S at tau_{i} of row {j + 1}", on_ellipsoid)
-            if polytope is not None and faces is not None:
+            if faces is not None:
                 left = faces.left_of(image, len(faces.rows) + plant.m + i * k + j, low, high) - least
                 yield scalar_condition(f"(PB) |c x| + rho <= 1 - eta on the polytope at tau_{i} of row {j + 1}", left)
 

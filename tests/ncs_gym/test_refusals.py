@@ -54,7 +54,9 @@ from ncs_gym import (
 from ncs_gym.bounds import as_set
 from ncs_gym.envs.env import RenderModeError, ncs_env
 from ncs_gym.model import zero_order_hold
-from ncs_gym.processes import CartPoleProcess, InvertedPendulumProcess, PendulumProcess, pendulum
+from ncs_gym.processes.cart_pole_process import CartPoleProcess
+from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
+from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
 from ncs_gym.uncertainty.disturbances import as_disturbance, checked
 from tests.product import altered, linear_plant
 

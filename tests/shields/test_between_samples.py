@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from ncs_gym import Channel, ChannelContract, Packet, truck_trailer
-from ncs_gym.network import downlink_protocol
+from ncs_gym.network.downlink import downlink_protocol
 from shields import Certificate, Infeasible, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.decisions import Decision

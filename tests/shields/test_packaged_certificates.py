@@ -10,7 +10,7 @@ import pytest
 
 import shields.packaged_certificates
 from ncs_gym import ChannelContract, contract_of
-from ncs_gym.network import downlink_protocol
+from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.registration import ENVIRONMENTS
 from shields import CertificateError, certificate_for
 from shields.packaged_certificates import certificate_of_package

@@ -27,7 +27,7 @@ from ncs_gym import (
     SphereDisturbance,
     TraceChannel,
 )
-from ncs_gym.processes import CartPoleProcess, nonlinear_cart_pole
+from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_pole
 from ncs_gym.registration import registered_ids
 from shields import SafetyShield
 from tests.certificates import certificate_of

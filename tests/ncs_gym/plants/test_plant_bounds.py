@@ -5,7 +5,9 @@ import pytest
 
 import ncs_gym
 from ncs_gym import BoxDisturbance, Ellipsoid, Estimator, truck_trailer
-from ncs_gym.processes import inverted_pendulum, nonlinear_cart_pole, pendulum
+from ncs_gym.processes.cart_pole_process import nonlinear_cart_pole
+from ncs_gym.processes.gym_pendulum import pendulum
+from ncs_gym.processes.mujoco_pendulum import inverted_pendulum
 from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.product import altered, library_plant, linear_plant

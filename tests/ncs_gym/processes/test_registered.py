@@ -9,15 +9,9 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import ncs_gym
-from ncs_gym.processes import (
-    CartPoleProcess,
-    InvertedPendulumProcess,
-    PendulumProcess,
-    inverted_pendulum,
-    nonlinear_cart_pole,
-)
-from ncs_gym.processes.cart_pole_process import sampled_cart_pole
-from ncs_gym.processes.mujoco_pendulum import sampled_inverted_pendulum
+from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_pole, sampled_cart_pole
+from ncs_gym.processes.gym_pendulum import PendulumProcess
+from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess, inverted_pendulum, sampled_inverted_pendulum
 from ncs_gym.registration import needing_extras, registered_ids
 
 IDS = ("ncs_gym/Pendulum-v0", "ncs_gym/CartPoleNonlinear-v0", "ncs_gym/InvertedPendulum-v0")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Actuator, Channel, Ellipsoid, FunctionProcess, cart_pole, truck_trailer
-from ncs_gym.network import downlink_protocol
+from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from shields.runtime.guarantee import (
     EXPLANATIONS,

@@ -17,7 +17,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.estimation.first_estimate import first_estimate
-from ncs_gym.processes import nonlinear_cart_pole
+from ncs_gym.processes.cart_pole_process import nonlinear_cart_pole
 from shields.runtime.guarantee import (
     ALARM,
     LATE_INPUT,

@@ -14,7 +14,7 @@ import pytest
 from scipy.linalg import expm
 
 from ncs_gym import Channel, LinearPlant, Packet
-from ncs_gym.network import downlink_protocol
+from ncs_gym.network.downlink import downlink_protocol
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor
 from shields.synthesis.polytope_certificates import with_polytope
