@@ -108,16 +108,16 @@ def compare(settings: CompareSettings) -> Comparison:
     verification = verify(certificate, plant)
     print(wrapped(certificate_line(certificate, verification)), flush=True)
     if is_any_trained(settings, names):
-        print(wrapped(settings.agent_line), flush=True)
+        print(*(wrapped(each.agent_line) for each in settings.by_algorithm), sep="\n", flush=True)
     settings = settings.completed
 
     runs = [run_of_arm(settings, loop, certificate, name, index) for index in range(settings.seeds) for name in names]
     runs.sort(key=lambda run: run.trains)  # first those that are evaluated only: they take a second
     results = results_of(runs, settings.out, settings)
 
-    common = {"environment": id_alone(settings.env), "algorithm": settings.algo}
+    common = {"environment": id_alone(settings.env), "algorithm": settings.algorithm}
     episodes, arms = episodes_table(results, **common), arm_summaries(results, settings.mode)
-    baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
+    baseline = next((name for name in settings.arms if name.endswith("unshielded")), settings.arms[0])
     compared = episodes[episodes["arm"].isin(settings.arms)]
     summary = {
         "arms": {name: arms[name] for name in settings.arms},
@@ -172,7 +172,7 @@ def _with_full_names(settings: CompareSettings) -> CompareSettings:
 
     Of the usual baselines those that do not know what the task asks for are left out.
     """
-    arms, baselines = (full_names(names, settings.mode) for names in (settings.arms, settings.baselines))
+    arms, baselines = (full_names(names, settings) for names in (settings.arms, settings.baselines))
     if settings.baselines == type(settings).baselines:
         task = registered_env(settings.env).task
         reasons = {name: why_aimless(Arm.of(name, settings.mode).policy, task) for name in baselines}
