@@ -23,7 +23,7 @@ from experiments.backends.execution import results_of
 from experiments.baselines import why_aimless
 from experiments.plots.comparison_figures import comparison_figures, most_overridden
 from experiments.report.html import comparison_report
-from experiments.report.text_tables import certificate_line, decimals_of, scenario_text, summary_text
+from experiments.report.text_tables import certificate_line, decimals_of, summary_text
 from experiments.runs.arms import Arm, by_arm, full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config, registered_env
 from experiments.runs.output_folder import claim_folder, write_results
@@ -150,8 +150,6 @@ def compare(settings: CompareSettings) -> Comparison:
     runs_per_arm = counted(settings.seeds, "run")
     print(f"\n{wrapped(f'{settings.env}: {runs_per_arm} and {per_run}')}\n")
     print(summary_text(summary["arms"], summary["references"]))
-    for scenario in next(iter(summary["arms"].values()))["conditions"]:
-        print("\n" + scenario_text(scenario, summary["arms"], summary["references"]))
     print(*map(wrapped, findings), f"files: {settings.out}", sep="\n")
     return Comparison(episodes, summary, results)
 
