@@ -101,7 +101,7 @@ class BackendSettings:
     """Where training runs are executed; their results do not depend on it.
 
     Attributes:
-        engine: "local" uses processes of this machine, "ray" a Ray cluster (docs/vector.md).
+        engine: "local" uses processes of this machine, "ray" a Ray cluster.
         jobs: Worker processes of the engine "local".
         ray_address: Of the engine "ray": "local" starts a Ray, "auto" and HOST:PORT join one of which this is a node.
     """
@@ -147,13 +147,13 @@ class LearningSettings(BackendSettings):
             of several algorithms the most.
         episodes: Evaluation episodes per run.
         algorithms: Learning algorithms, each of which trains every arm; TRPO, TQC and CrossQ need sb3-contrib.
-        mode: What the shield applies in place of an unsafe action (docs/shield.md).
+        mode: What the shield applies in place of an unsafe action (in the documentation under "The shield").
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         intervention_penalty: Taken from the reward per intervention, in arms with "+penalty".
         violation_penalty: Taken from the reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
         safe_set: What a synthesized certificate keeps.
-        between_samples: Times per step at which the safe box counts (docs/shield.md); by default the plant's own.
+        between_samples: Times per step at which the safe box counts; by default the plant's own.
         channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
             jitter, send_period, quantization_step, max_consecutive_losses.
         hyperparams: Hyperparameters in the words of stable-baselines3, such as gamma=0.99 or

@@ -52,10 +52,11 @@ class CompareSettings(LearningSettings):
             penalized:WEIGHT, lagrangian (adapts it), shielded, shielded:MODE, lookahead, trusting (no error set), psf
             (predictive filter), also with a margin in percent, psf:20, psf:tube; shield-at-test; also with +penalty.
             Untrained: lqr, mpc, mpc:20, random, K-x_hat, zero-input, untrained, pretrained, alone or behind a filter,
-            lqr+shielded (docs/experiments.md).
+            lqr+shielded.
         baselines: Arms that are listed below the others and not drawn.
         scenarios: Other evaluations: worst-case-disturbance, worse-channel, ideal-channel, attacked,
-            attacked-on-an-ideal-channel, gaussian (docs/experiments.md).
+            attacked-on-an-ideal-channel, gaussian (in the
+            documentation under "Experiments").
         tuned_arms: Whether arms are trained with what was tuned for each by itself (`benchmarks.learning`); no option
             of the command line.
     """
