@@ -67,6 +67,11 @@ _OF_TRAINING = {"torch", "stable_baselines3"}
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 
+def __dir__() -> list[str]:
+    """Returns the public names, of which none needs to be imported yet."""
+    return __all__
+
+
 def __getattr__(name: str) -> Any:
     """Imports the module of a public name when the name is first asked for.
 

@@ -101,7 +101,7 @@ class BackendSettings:
     """Where training runs are executed; their results do not depend on it.
 
     Attributes:
-        engine: "local" uses processes of this machine, "ray" a Ray cluster (docs/vector.md).
+        engine: "local" uses processes of this machine, "ray" a Ray cluster.
         jobs: Worker processes of the engine "local".
         ray_address: Of the engine "ray": "local" starts a Ray, "auto" and HOST:PORT join one of which this is a node.
     """
@@ -143,16 +143,17 @@ class LearningSettings(BackendSettings):
     Attributes:
         env: Id of an environment with a plant; module:id imports the module first.
         seed: Seed of the experiment, >= 0.
-        steps: Training steps per run, in whole rollouts; by default those tuned for the environment, or 150,000.
+        steps: Training steps per run, in whole rollouts; by default those tuned for the environment, or 150,000, and
+            of several algorithms the most.
         episodes: Evaluation episodes per run.
-        algo: Learning algorithm; TRPO, TQC and CrossQ need sb3-contrib.
-        mode: What the shield applies in place of an unsafe action (docs/shield.md).
+        algorithms: Learning algorithms, each of which trains every arm; TRPO, TQC and CrossQ need sb3-contrib.
+        mode: What the shield applies in place of an unsafe action (in the documentation under "The shield").
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         intervention_penalty: Taken from the reward per intervention, in arms with "+penalty".
         violation_penalty: Taken from the reward per violating step, in the arm "penalized".
         certificate: Certificate file to use instead of synthesizing one.
         safe_set: What a synthesized certificate keeps.
-        between_samples: Times per step at which the safe box counts (docs/shield.md); by default the plant's own.
+        between_samples: Times per step at which the safe box counts; by default the plant's own.
         channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
             jitter, send_period, quantization_step, max_consecutive_losses.
         hyperparams: Hyperparameters in the words of stable-baselines3, such as gamma=0.99 or
@@ -166,7 +167,7 @@ class LearningSettings(BackendSettings):
     seed: int = 0
     steps: int | None = None
     episodes: int = 200
-    algo: Algorithm = "PPO"
+    algorithms: tuple[Algorithm, ...] = ("PPO",)
     mode: Mode = "project"
     horizon: int | None = None
     intervention_penalty: float = 0.1
@@ -181,11 +182,16 @@ class LearningSettings(BackendSettings):
     force: bool = False
 
     @property
+    def algorithm(self) -> Algorithm:
+        """The algorithm, of several the first one."""
+        return self.algorithms[0]
+
+    @property
     def all_hyperparams(self) -> dict[str, Any]:
         """All hyperparameters of the algorithm: those given, those tuned, the defaults."""
-        given, env_id = self.hyperparams, id_alone(self.env)
-        tuned = None if given.keys() >= DEFAULTS[self.algo].keys() else tuned_hyperparams(env_id, self.algo)
-        found = with_changes(with_changes(DEFAULTS[self.algo], tuned or {}), given)
+        given, defaults = self.hyperparams, DEFAULTS[self.algorithm]
+        tuned = None if given.keys() >= defaults.keys() else tuned_hyperparams(id_alone(self.env), self.algorithm)
+        found = with_changes(with_changes(defaults, tuned or {}), given)
         return {name: value for name, value in found.items() if name != "n_timesteps"}
 
     @property
@@ -197,7 +203,8 @@ class LearningSettings(BackendSettings):
         """
         if self.steps is not None:
             return self.steps
-        steps = self.hyperparams.get("n_timesteps", tuned_steps(id_alone(self.env), self.algo) or _DEFAULT_STEPS)
+        tuned = max(tuned_steps(id_alone(self.env), algorithm) or _DEFAULT_STEPS for algorithm in self.algorithms)
+        steps = self.hyperparams.get("n_timesteps", tuned)
         if type(steps) not in (int, float) or not 1 <= steps < 1e15 or steps != int(steps):
             raise ValueError(f"n_timesteps must be a whole number >= 1, got {shown(steps)}")
         return int(steps)
@@ -206,21 +213,29 @@ class LearningSettings(BackendSettings):
     def agent_line(self) -> str:
         """One line with all hyperparameters of the algorithm and where they come from."""
         found, given = self.all_hyperparams, self.hyperparams.keys() - {"n_timesteps"}
-        is_tuned = tuned_hyperparams(id_alone(self.env), self.algo) is not None
+        is_tuned = tuned_hyperparams(id_alone(self.env), self.algorithm) is not None
         source = f"hyperparameters tuned for {id_alone(self.env)}" if is_tuned else "default hyperparameters"
         if given == found.keys():
             source = "hyperparameters as given"
         elif given:
             source += f", as given {', '.join(name for name in found if name in given)}"
-        return f"{self.algo}, {source}: " + ", ".join(f"{name}={value}" for name, value in found.items())
+        return f"{self.algorithm}, {source}: " + ", ".join(f"{name}={value}" for name, value in found.items())
+
+    @property
+    def by_algorithm(self) -> list[Self]:
+        """The settings of each algorithm alone, which all train for equally many steps."""
+        return [replace(self, algorithms=(name,), steps=self.training_steps) for name in self.algorithms]
 
     @property
     def completed(self) -> Self:
-        """The same settings with the steps and all hyperparameters given, for settings.json."""
-        return replace(self, steps=self.training_steps, hyperparams=self.all_hyperparams)
+        """The same settings for settings.json, with the steps, and with all hyperparameters of a single algorithm."""
+        hyperparams = self.all_hyperparams if len(self.algorithms) == 1 else self.hyperparams
+        return replace(self, steps=self.training_steps, hyperparams=hyperparams)
 
     def __post_init__(self) -> None:
         BackendSettings.__post_init__(self)
+        if not self.algorithms or len(set(self.algorithms)) != len(self.algorithms):
+            raise ValueError("--algorithms must be different algorithms, at least one")
         counts = {"seeds": 1, "steps": 1, "episodes": 1, "seed": 0}
         require_limits(self, **counts, intervention_penalty=0, violation_penalty=0)
         arms = getattr(self, "arm", ""), *getattr(self, "arms", ()), *getattr(self, "baselines", ())

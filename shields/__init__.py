@@ -69,6 +69,11 @@ _NAMES = {
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 
 
+def __dir__() -> list[str]:
+    """Returns the public names, of which none needs to be imported yet."""
+    return __all__
+
+
 def __getattr__(name: str) -> Any:
     """Returns a public name, or module, whose import takes long."""
     if name in _MODULE_OF:

@@ -98,6 +98,22 @@ def test_tables_have_a_header_and_no_gap(page):
         assert re.fullmatch(r"\|(?:-+\|)+", table.splitlines()[1]), table
 
 
+def test_messages_and_help_name_pages_as_the_navigation_calls_them():
+    named, files = set(), []
+    for path in (path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
+        text = path.read_text()
+        named |= {" ".join(name.split()) for name in re.findall(r"documentation\s+under[\s\"']+([^\"]+)\"", text)}
+        nodes = list(ast.walk(ast.parse(text)))
+        documented = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        texts = [node for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+        said = [node.value for node in texts if id(node) not in documented]
+        files += [text for text in said if re.search(r"docs/\w+\.md", text) and " " in text]
+    navigation = (ROOT / "mkdocs.yml").read_text()
+    assert named
+    assert [name for name in named if f"- {name}: " not in navigation] == []
+    assert files == []
+
+
 def test_navigation_has_every_page_once():
     nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
     pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}

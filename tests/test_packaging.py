@@ -147,6 +147,7 @@ def test_few_names_are_public_and_each_is_documented():
     public = set()
     for init in (path for path in MODULES if path.name == "__init__.py"):
         package = importlib.import_module(".".join(init.parent.relative_to(ROOT).parts))
+        assert set(getattr(package, "__all__", ())) <= set(dir(package))
         for name in getattr(package, "__all__", ()):
             exported = getattr(package, name)
             public.add((name, id(exported)))

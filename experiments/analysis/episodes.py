@@ -46,11 +46,13 @@ def episodes_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
 
     Args:
         results: Results of training runs.
-        **common: Columns with the same value in all rows: the environment, the algorithm, what a sweep varies.
+        **common: Columns with the same value in all rows: the environment, the algorithm, what a sweep varies. An arm
+            with an algorithm of its own has that.
     """
     rows = [
         common
-        | {"arm": result.arm, "run": result.index, "scenario": scenario}
+        | _of_arm(result.arm)
+        | {"run": result.index, "scenario": scenario}
         | {column: getattr(episode, name) for name, column in _OF_EPISODE.items()}
         for result in results
         for scenario, played in ({AS_TRAINED: result.episodes} | result.scenarios).items()
@@ -60,11 +62,18 @@ def episodes_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
     return table.assign(violating=table["violating_steps"] > 0, outside_S=~(table["times_safe_set"] <= 1.0))
 
 
+def _of_arm(name: str) -> dict[str, str]:
+    """Returns the columns of an arm: its name, and its algorithm if it has one of its own."""
+    algorithm = Arm.of(name).algorithm
+    return {"arm": name} | ({"algorithm": algorithm} if algorithm else {})
+
+
 def training_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
     """Returns a row per point of a training's history, with totals so far; docs/experiments.md explains the columns."""
     rows = [
         common
-        | {"arm": result.arm, "run": result.index}
+        | _of_arm(result.arm)
+        | {"run": result.index}
         | {column: getattr(point, name) for name, column in _OF_TRAINING.items()}
         for result in results
         for point in result.history

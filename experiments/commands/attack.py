@@ -184,8 +184,8 @@ def table_of(rows: dict[str, Counter[str]]) -> str:
     """Returns the counts of each case and their sum, with a legend."""
     total = sum(rows.values(), Counter[str]())
     columns = ("steps", "episodes", "outside S", "outside box", "no claim")
-    table = [["", "", "", "outside", "outside", "no", "over-"]]
-    table += [["case", "steps", "episodes", "S", "box", "claim", "ridden"]]
+    table = [["", "", "", "outside", "outside", "no", ""]]
+    table += [["case", "steps", "episodes", "S", "box", "claim", "overridden"]]
     env_id = ""
     for name, counts in [*rows.items(), ("all", total)]:
         before, (env_id, comma, kind) = env_id, name.rpartition(", ")

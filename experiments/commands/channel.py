@@ -30,7 +30,8 @@ class ChannelSettings:
 
     Attributes:
         file: A table with the columns sent and received in seconds, received empty where a packet was lost, or the
-            output of Linux `ping -D` (docs/contracts.md has recipes for others).
+            output of Linux `ping -D` (recipes for others are in the documentation under
+            "Contracts and recorded networks").
         sampling_period: Duration of a control step [s]; by default that of --env or --plant, or the time between
             packets.
         env: Id of an environment whose contract is compared with the record.

@@ -23,7 +23,7 @@ from experiments.backends.execution import results_of
 from experiments.baselines import why_aimless
 from experiments.plots.comparison_figures import comparison_figures, most_overridden
 from experiments.report.html import comparison_report
-from experiments.report.text_tables import certificate_line, decimals_of, scenario_text, summary_text
+from experiments.report.text_tables import certificate_line, decimals_of, summary_text
 from experiments.runs.arms import Arm, by_arm, full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config, registered_env
 from experiments.runs.output_folder import claim_folder, write_results
@@ -52,10 +52,11 @@ class CompareSettings(LearningSettings):
             penalized:WEIGHT, lagrangian (adapts it), shielded, shielded:MODE, lookahead, trusting (no error set), psf
             (predictive filter), also with a margin in percent, psf:20, psf:tube; shield-at-test; also with +penalty.
             Untrained: lqr, mpc, mpc:20, random, K-x_hat, zero-input, untrained, pretrained, alone or behind a filter,
-            lqr+shielded (docs/experiments.md).
+            lqr+shielded.
         baselines: Arms that are listed below the others and not drawn.
         scenarios: Other evaluations: worst-case-disturbance, worse-channel, ideal-channel, attacked,
-            attacked-on-an-ideal-channel, gaussian (docs/experiments.md).
+            attacked-on-an-ideal-channel, gaussian (in the
+            documentation under "Experiments").
         tuned_arms: Whether arms are trained with what was tuned for each by itself (`benchmarks.learning`); no option
             of the command line.
     """
@@ -108,16 +109,16 @@ def compare(settings: CompareSettings) -> Comparison:
     verification = verify(certificate, plant)
     print(wrapped(certificate_line(certificate, verification)), flush=True)
     if is_any_trained(settings, names):
-        print(wrapped(settings.agent_line), flush=True)
+        print(*(wrapped(each.agent_line) for each in settings.by_algorithm), sep="\n", flush=True)
     settings = settings.completed
 
     runs = [run_of_arm(settings, loop, certificate, name, index) for index in range(settings.seeds) for name in names]
     runs.sort(key=lambda run: run.trains)  # first those that are evaluated only: they take a second
     results = results_of(runs, settings.out, settings)
 
-    common = {"environment": id_alone(settings.env), "algorithm": settings.algo}
+    common = {"environment": id_alone(settings.env), "algorithm": settings.algorithm}
     episodes, arms = episodes_table(results, **common), arm_summaries(results, settings.mode)
-    baseline = "unshielded" if "unshielded" in settings.arms else settings.arms[0]
+    baseline = next((name for name in settings.arms if name.endswith("unshielded")), settings.arms[0])
     compared = episodes[episodes["arm"].isin(settings.arms)]
     summary = {
         "arms": {name: arms[name] for name in settings.arms},
@@ -150,8 +151,6 @@ def compare(settings: CompareSettings) -> Comparison:
     runs_per_arm = counted(settings.seeds, "run")
     print(f"\n{wrapped(f'{settings.env}: {runs_per_arm} and {per_run}')}\n")
     print(summary_text(summary["arms"], summary["references"]))
-    for scenario in next(iter(summary["arms"].values()))["conditions"]:
-        print("\n" + scenario_text(scenario, summary["arms"], summary["references"]))
     print(*map(wrapped, findings), f"files: {settings.out}", sep="\n")
     return Comparison(episodes, summary, results)
 
@@ -172,7 +171,7 @@ def _with_full_names(settings: CompareSettings) -> CompareSettings:
 
     Of the usual baselines those that do not know what the task asks for are left out.
     """
-    arms, baselines = (full_names(names, settings.mode) for names in (settings.arms, settings.baselines))
+    arms, baselines = (full_names(names, settings) for names in (settings.arms, settings.baselines))
     if settings.baselines == type(settings).baselines:
         task = registered_env(settings.env).task
         reasons = {name: why_aimless(Arm.of(name, settings.mode).policy, task) for name in baselines}

@@ -17,7 +17,7 @@ from shields import Certificate, CertificateError, export
 
 @dataclass(frozen=True, kw_only=True)
 class ExportCSettings:
-    """Writes a safety filter in C99 for a board, with test vectors that check it (docs/deployment.md).
+    """Writes a safety filter in C99 for a board, with test vectors that check it.
 
     Attributes:
         file: File of the certificate (JSON): with a polytope, under a channel contract.

@@ -27,7 +27,7 @@ from shields.atomic_write import write_atomically
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """Draws an episode of a policy, as an animation or its last frame (docs/ncs_gym.md).
+    """Draws an episode of a policy, as an animation or its last frame.
 
     Attributes:
         env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of

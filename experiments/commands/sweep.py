@@ -68,7 +68,7 @@ def sweep(settings: SweepSettings) -> None:
     sides = {"losses": settings.losses, "delays": settings.delays}
     ends = {name: tuple(dict.fromkeys((side[0], side[-1]))) for name, side in sides.items()}
     settings = short_version(settings, **_SMOKE, **ends)
-    settings = replace(settings, arms=full_names(settings.arms, settings.mode))
+    settings = replace(settings, arms=full_names(settings.arms, settings))
     points = [{"loss": loss, "delay": delay} for loss, delay in product(settings.losses, settings.delays)]
     own = settings.between_samples
     loops = [loop_config(settings.env, settings.channel | point, between_samples=own) for point in points]
@@ -76,7 +76,7 @@ def sweep(settings: SweepSettings) -> None:
     certificate = certificate_of(loops[0], settings.certificate, settings.safe_set)  # the contract is the same for all
     claim_folder("sweep", settings.completed)
     if is_any_trained(settings, settings.arms):
-        print(wrapped(settings.agent_line), flush=True)
+        print(*(wrapped(each.agent_line) for each in settings.by_algorithm), sep="\n", flush=True)
     settings = settings.completed
     runs = [
         run_of_arm(settings, loop, certificate, name, index, grid_point=f"loss{point['loss']}-delay{point['delay']}")
@@ -87,7 +87,7 @@ def sweep(settings: SweepSettings) -> None:
     results = results_of(runs, settings.out, settings)
     per_point = len(runs) // len(points)
     parts = [results[i * per_point : (i + 1) * per_point] for i in range(len(points))]
-    common = {"environment": id_alone(settings.env), "algorithm": settings.algo}
+    common = {"environment": id_alone(settings.env), "algorithm": settings.algorithm}
     cells = [
         point | {"mean_loss": ncs_env(loop.single()).channel.mean_loss, "arms": arm_summaries(part, settings.mode)}
         for point, loop, part in zip(points, loops, parts, strict=True)

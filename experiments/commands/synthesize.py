@@ -27,7 +27,7 @@ class SynthesizeSettings:
         safe_set: What a shield with this certificate keeps: the ellipsoid, or the largest polytope that the same gain
             keeps in the safe box, which leaves the policy more room. By default the polytope.
         between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
-            own; 1 for the sampling instants alone (docs/shield.md).
+            own; 1 for the sampling instants alone.
         time_limit: Seconds of the processor's time after which the best certificate so far is verified and saved, and
             says so; None for no limit: then the search ends by counted work, on every machine alike.
         out: File for the certificate (JSON).

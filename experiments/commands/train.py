@@ -40,6 +40,8 @@ _SMOKE = {"steps": 4_096, "episodes": 10}
 
 def train(settings: TrainSettings) -> None:
     """Runs `ncs train`."""
+    if len(settings.algorithms) > 1:
+        raise ValueError("--algorithms must be one for `ncs train`: `ncs compare` takes several")
     settings = short_version(settings, **_SMOKE)
     arm = Arm.of(settings.arm, settings.mode)
     loop = loop_config(settings.env, settings.channel, between_samples=settings.between_samples)

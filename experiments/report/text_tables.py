@@ -6,6 +6,7 @@ from collections.abc import Callable
 from math import floor, log10
 from typing import Any
 
+from experiments.runs.loops import AS_TRAINED
 from experiments.terminal import text_table, wrapped
 from ncs_gym.validation import counted
 from shields import Certificate, Report
@@ -23,29 +24,30 @@ def summary_text(arms: _Arms, baselines: _Arms) -> str:
     Violating episodes have their exact interval, the return has Student's (`experiments.analysis.episodes`). "Outside
     S" counts episodes in which the true state was outside the safe set at some step, be it the first one, "from a plan"
     the steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store. The training
-    of those that were trained has a table of its own.
+    of those that were trained has a table of its own, scenarios are parts of that of the evaluation.
     """
     everything = arms | baselines
     trained = {name: arm for name, arm in everything.items() if arm["train_steps"]}
-    evaluated = _text(everything, len(arms), _EVALUATION)
-    return f"{_text(trained, len(trained), _TRAINING)}\n\n{evaluated}" if trained else evaluated
-
-
-def scenario_text(scenario: str, arms: _Arms, baselines: _Arms) -> str:
-    """Returns the table of the evaluation in a scenario, with its name in the corner."""
-    played = {name: arm | arm["conditions"][scenario] for name, arm in (arms | baselines).items()}
-    return _text(played, len(arms), _EVALUATION, f"{scenario}:")
-
-
-def _text(arms: _Arms, above: int, columns: list[_Column], corner: str = "") -> str:
-    """Returns a table, with a rule below so many arms, and a column of plans if an arm looks ahead."""
-    if columns is _EVALUATION and any(arm["mode"] == "lookahead" for arm in arms.values()):
+    scenarios = next(iter(arms.values()))["conditions"]
+    parts = {AS_TRAINED if scenarios else "": everything}
+    parts |= {name: {key: arm | arm["conditions"][name] for key, arm in everything.items()} for name in scenarios}
+    columns = _EVALUATION
+    if any(arm["mode"] == "lookahead" for arm in everything.values()):
         columns = [*columns[:-1], _PLANNED, columns[-1]]
-    titles = list(zip(*(header for header, _ in columns), strict=True))
-    first = ["" if corner and title.endswith(":") else title for title in titles[0]]
-    rows = [[corner, *first], *(["", *line] for line in titles[1:])]
-    rows += [[name, *(show(arm) for _, show in columns)] for name, arm in arms.items()]
-    return text_table(rows, rules=(len(titles), len(titles) + above))
+    evaluated = _text("evaluation", parts, columns, len(arms))
+    return f"{_text('training', {'': trained}, _TRAINING)}\n\n{evaluated}" if trained else evaluated
+
+
+def _text(corner: str, parts: dict[str, _Arms], columns: list[_Column], above: int = 0) -> str:
+    """Returns a table with a part per scenario, in which a rule follows so many arms."""
+    first, second = zip(*(header for header, _ in columns), strict=True)
+    rows, rules = [[corner, *first], ["", *second]], []
+    for title, arms in parts.items():
+        rules.append(len(rows))
+        rows += [[title]] * bool(title)
+        rules.append(len(rows) + above)
+        rows += [[name, *(show(arm) for _, show in columns)] for name, arm in arms.items()]
+    return text_table(rows, rules)
 
 
 def _overridden(arm: dict[str, Any], key: str = "intervention_rate", mode: str = "mode") -> str:
@@ -69,21 +71,21 @@ def _return_text(arm: dict[str, Any]) -> str:
     return f"{mean:z.{decimals}f} +-{half:.{decimals}f}"
 
 
-# Three lines of the header of a column, and its text of the summary of an arm.
-_Column = tuple[tuple[str, str, str], Callable[[dict[str, Any]], str]]
+# Two lines of the header of a column, and its text of the summary of an arm.
+_Column = tuple[tuple[str, str], Callable[[dict[str, Any]], str]]
 _TRAINING: list[_Column] = [
-    (("training:", "violating", "steps"), lambda arm: f"{arm['train_violation_steps']:,}"),
-    (("over-", "ridden", "[%]"), lambda arm: _overridden(arm, "train_intervention_rate", "train_mode")),
+    (("violating", "steps"), lambda arm: f"{arm['train_violation_steps']:,}"),
+    (("overridden", "[%]"), lambda arm: _overridden(arm, "train_intervention_rate", "train_mode")),
 ]
 _EVALUATION: list[_Column] = [
-    (("evaluation:", "violating:", "episodes [%]"), _violating),
-    (("", "", "steps"), lambda arm: f"{arm['eval_violation_steps']:,}"),
-    (("out-", "side", "S"), lambda arm: f"{arm['eval_episodes_outside_set']:,}"),
-    (("over-", "ridden", "[%]"), _overridden),
-    (("", "return", "[95 % CI]"), _return_text),
+    (("violating:", "episodes [%]"), _violating),
+    (("", "steps"), lambda arm: f"{arm['eval_violation_steps']:,}"),
+    (("outside", "S"), lambda arm: f"{arm['eval_episodes_outside_set']:,}"),
+    (("overridden", "[%]"), _overridden),
+    (("return", "[95 % CI]"), _return_text),
 ]
 _PLANNED: _Column = (
-    ("from a", "plan", "[%]"),
+    ("from a", "plan [%]"),
     lambda arm: f"{100 * arm['plan_rate']:.1f}" if arm["mode"] == "lookahead" else "-",
 )
 
@@ -98,8 +100,8 @@ def decimals_of(*numbers: float) -> int:
 
 def sweep_table(cells: list[dict[str, Any]]) -> str:
     """Returns a row per point of the grid and arm, and below it where proofs did not hold."""
-    rows = [["", "", "", "violating", "violating", "over-", ""]]
-    rows += [["loss", "delay", "arm", "episodes", "training", "ridden", "return"]]
+    rows = [["", "", "", "violating", "violating", "", ""]]
+    rows += [["loss", "delay", "arm", "episodes", "training", "overridden", "return"]]
     lost = []
     for cell in cells:
         for name, arm in cell["arms"].items():

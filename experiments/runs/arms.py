@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 from agents.agent_file import AGENT_FILES, pretrained_folder
-from agents.hyperparams import with_changes
+from agents.hyperparams import ALGORITHMS, with_changes
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import (
     CONTROLLERS,
@@ -52,6 +52,7 @@ class Arm:
         violation_weight: Price of a violating step; None for that of the settings.
         adapts_penalty: Whether that price is adapted during training.
         filters_training: Whether shield or filter act in training too.
+        algorithm: Algorithm that trains the agents, the first word of the name; empty for that of the settings.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Arm:
     violation_weight: float | None = None
     adapts_penalty: bool = False
     filters_training: bool = True
+    algorithm: str = ""
 
     @classmethod
     def of(cls, name: str, mode: str = "project") -> Arm:
@@ -117,9 +119,13 @@ class Arm:
         return training, filtered()
 
 
-def full_names(names: Sequence[str], mode: str) -> tuple[str, ...]:
-    """Returns the full names of arms, under which results are kept; see `Arm.of`."""
-    return tuple(Arm.of(name, mode).name for name in names)
+def full_names(names: Sequence[str], settings: LearningSettings) -> tuple[str, ...]:
+    """Returns the full names of arms, under which results are kept; several algorithms have an arm each."""
+    found: list[str] = []
+    for arm in (Arm.of(name, settings.mode) for name in names):
+        several = len(settings.algorithms) > 1 and arm.is_trained and not arm.algorithm
+        found += [f"{each} {arm.name}" for each in settings.algorithms] if several else [arm.name]
+    return tuple(found)
 
 
 def is_shield(mode: str | None) -> bool:
@@ -147,6 +153,9 @@ def _parsed(text: str, mode: str) -> Arm:
     }
     if name in alone:
         return alone[name]
+    algorithm = name.partition(" ")[0]
+    if algorithm in ALGORITHMS and (arm := _parsed(text[len(algorithm) + 1 :], mode)).is_trained and not arm.algorithm:
+        return replace(arm, name=f"{algorithm} {arm.name}", algorithm=algorithm)
     if name in _POLICIES:
         return Arm(name, policy=name)
     modes = {"shielded": mode, "lookahead": "lookahead"} | {f"shielded:{each}": each for each in _SHIELD_MODES}
@@ -177,11 +186,14 @@ def require_arms(settings: LearningSettings, loop: LoopConfig, names: Sequence[s
         ValueError: If an arm or a scenario is unknown, an arm cannot pursue the task, a scenario cannot be simulated,
             or agents cannot be trained with the hyperparameters given.
     """
-    require_trainable(settings, loop)
+    for each in settings.by_algorithm:
+        require_trainable(each, loop)
     task = registered_env(loop.env).task
-    for name in names:
-        if problem := why_aimless(Arm.of(name, settings.mode).policy, task):
-            raise ValueError(f"arm {name}: {problem}")
+    for arm in (Arm.of(name, settings.mode) for name in names):
+        if arm.algorithm and (len(settings.algorithms) == 1 or arm.algorithm not in settings.algorithms):
+            raise ValueError(f"arm {arm.name}: {arm.algorithm} must be one of several in --algorithms")
+        if problem := why_aimless(arm.policy, task):
+            raise ValueError(f"arm {arm.name}: {problem}")
     for scenario in other_scenarios(getattr(settings, "scenarios", ())):
         try:
             under(scenario, loop).single().close()
@@ -208,7 +220,10 @@ def run_of_arm(
         ValueError: If the arm or a scenario is unknown.
         AgentError: If the arm is the pretrained agent's, and the package has none for the environment.
     """
-    arm, hyperparams = Arm.of(arm_name, settings.mode), settings.all_hyperparams
+    arm = Arm.of(arm_name, settings.mode)
+    if arm.algorithm:
+        settings = replace(settings, algorithms=(arm.algorithm,))
+    hyperparams = settings.all_hyperparams
     if arm.is_trained and getattr(settings, "tuned_arms", False):
         own = dict(tuned_training(loop.env, arm.name))
         hyperparams = with_changes(hyperparams, own.pop("hyperparams", {}))
@@ -240,7 +255,7 @@ def run_of_arm(
         episodes=settings.episodes,
         certificate=certificate,
         scenarios=other_scenarios(getattr(settings, "scenarios", ())),
-        algorithm=settings.algo,
+        algorithm=settings.algorithm,
         settings=hyperparams,
         grid_point=grid_point,
         agent_files=agent_files,

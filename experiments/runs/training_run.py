@@ -297,4 +297,4 @@ def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
     if settings.hyperparams or loop.lagrangian is not None:
         from agents import training  # imports torch
 
-        training.require_trainable(loop, settings.training_steps, settings.algo, settings.all_hyperparams)
+        training.require_trainable(loop, settings.training_steps, settings.algorithm, settings.all_hyperparams)

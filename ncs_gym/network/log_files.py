@@ -20,7 +20,8 @@ from ncs_gym.validation import reason_of, shown
 
 _FORMS = (
     "a record is a table with the columns sent and received alone, in seconds, received empty where a packet was lost, "
-    "or the output of Linux ping -D (docs/contracts.md has recipes for others)"
+    "or the output of Linux ping -D (recipes for others are in the documentation under "
+    '"Contracts and recorded networks")'
 )
 _NAMES = ["received", "sent"]
 _NUMBER = re.compile(r"[+-]?\d{1,20}(?:\.\d{0,20})?(?:[eE][+-]?\d{1,3})?")

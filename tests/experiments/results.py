@@ -86,8 +86,8 @@ def summary_of(results: dict[str, list[RunResult]], **settings: Any) -> dict[str
 
 def provenance(**settings: Any) -> dict[str, Any]:
     """Settings, plant, certificate and versions as in a summary."""
-    own = {"env": "ncs_gym/TruckTrailer-v0", "algo": "PPO", "mode": "project", "seed": 5, "seeds": 2, "steps": 100}
-    own |= {"episodes": 2, "intervention_penalty": 0.25, "violation_penalty": 3.0}
+    own = {"env": "ncs_gym/TruckTrailer-v0", "algorithms": ["PPO"], "mode": "project", "seed": 5, "seeds": 2}
+    own |= {"steps": 100, "episodes": 2, "intervention_penalty": 0.25, "violation_penalty": 3.0}
     own |= {"hyperparams": {"n_envs": 64, "policy_kwargs": {"net_arch": [8, 8]}}, "certificate": None}
     return {
         "settings": own | settings,

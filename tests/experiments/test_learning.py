@@ -28,7 +28,7 @@ def test_steps_are_those_given_or_tuned_or_the_default():
     assert tuned_steps(CART_POLE) == CompareSettings(env=CART_POLE).training_steps == 600_000
     assert CompareSettings(env=CART_POLE, steps=150_000).training_steps == 150_000
     assert CompareSettings(env="plants:Plants/Tanks-v0").training_steps == 150_000
-    assert CompareSettings(env=CART_POLE, algo="A2C").training_steps == 150_000
+    assert CompareSettings(env=CART_POLE, algorithms=("A2C",)).training_steps == 150_000
     assert SweepSettings(env=CART_POLE).training_steps == 50_000
     assert CompareSettings(env=CART_POLE).completed.steps == 600_000
 
@@ -65,7 +65,7 @@ def test_what_is_given_wins_over_the_tuned_values():
 @pytest.mark.parametrize("algo", DEFAULTS)
 def test_what_cannot_be_trained_with_is_refused_before_anything_is_computed(algo):
     loop = loop_config("ncs_gym/TruckTrailer-v0")
-    require_trainable(TrainSettings(algo=algo, hyperparams={"gamma": 0.8}), loop)
+    require_trainable(TrainSettings(algorithms=(algo,), hyperparams={"gamma": 0.8}), loop)
     for change, words in (({"gamma": 2.0}, "gamma must be in"), ({"discount": 0.8}, "unknown hyperparameter")):
         with pytest.raises(ValueError, match=words):
-            require_trainable(TrainSettings(algo=algo, hyperparams=change), loop)
+            require_trainable(TrainSettings(algorithms=(algo,), hyperparams=change), loop)

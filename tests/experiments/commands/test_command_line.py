@@ -181,7 +181,7 @@ def test_saved_agent_is_evaluated(smoke, tmp_path):
 
 
 def test_one_agent_is_trained(tmp_path, without_workers):
-    run = succeeded("train", "--algo", "A2C", "--steps", "256", "--episodes", "3", "--out", tmp_path / "one")
+    run = succeeded("train", "--algorithms", "A2C", "--steps", "256", "--episodes", "3", "--out", tmp_path / "one")
     model = tmp_path / "one" / "models" / "shielded-0"
     assert f"agent: {model}" in run.stdout
     summary = json.loads((tmp_path / "one" / "summary.json").read_text())

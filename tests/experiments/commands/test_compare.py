@@ -10,8 +10,9 @@ from agents.loop import LoopConfig
 from agents.results import Episode
 from experiments.analysis.episodes import arm_summary, episodes_table, paired_differences
 from experiments.commands.compare import CompareSettings, shortened
+from experiments.commands.train import TrainSettings, train
 from experiments.report.text_tables import summary_text
-from experiments.runs.arms import run_of_arm
+from experiments.runs.arms import full_names, require_arms, run_of_arm
 from experiments.runs.training_run import RunResult
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
@@ -115,8 +116,45 @@ def cells_of(arms):
 @pytest.mark.parametrize("algo", ["PPO", "TRPO", "A2C", "SAC"])
 def test_settings_reach_every_run(certificate, algo):
     expected = complete_hyperparams(algo, tuned_hyperparams(CRUISE, algo)) | {"n_envs": 3}
-    for run in runs_of(certificate, steps=5007, episodes=9, algo=algo, hyperparams={"n_envs": 3}):
+    for run in runs_of(certificate, steps=5007, episodes=9, algorithms=(algo,), hyperparams={"n_envs": 3}):
         assert (run.steps, run.episodes, run.algorithm, run.settings) == (5007, 9, algo, expected)
+
+
+def test_several_algorithms_train_every_arm_and_name_their_rows(certificate):
+    settings = CompareSettings(algorithms=("PPO", "SAC"), hyperparams={"n_envs": 3})
+    names = full_names(("unshielded", "lqr", "PPO-lagrangian", "shielded"), settings)
+    arms = ("PPO unshielded", "SAC unshielded", "lqr", "PPO lagrangian", "PPO shielded", "SAC shielded")
+    assert names == arms
+    settings, loop = settings.completed, LoopConfig(env=CRUISE)
+    require_arms(settings, loop, names)
+    runs = {name: run_of_arm(settings, loop, certificate, name, 0) for name in names}
+    for name in (*arms[:2], *arms[3:]):
+        algorithm = name[:3]
+        expected = complete_hyperparams(algorithm, tuned_hyperparams(CRUISE, algorithm)) | {"n_envs": 3}
+        assert (runs[name].algorithm, runs[name].settings, runs[name].arm) == (algorithm, expected, name)
+    assert len({run.steps for run in runs.values()}) == 1
+    assert runs["SAC shielded"].loop.shield
+    assert not runs["SAC unshielded"].loop.shield
+    results = [replace(result([1.0], [0]), arm=name) for name in names]
+    rows = episodes_table(results, algorithm="PPO").set_index("arm")["algorithm"]
+    assert rows.to_dict() == {name: "SAC" if name.startswith("SAC") else "PPO" for name in names}
+
+
+@pytest.mark.parametrize(("arm", "algorithms"), [("SAC-shielded", ("PPO",)), ("TD3 unshielded", ("PPO", "SAC"))])
+def test_an_arm_of_another_algorithm_is_refused(arm, algorithms):
+    with pytest.raises(ValueError, match="must be one of several in --algorithms"):
+        require_arms(CompareSettings(algorithms=algorithms), LoopConfig(env=CRUISE), [arm])
+
+
+@pytest.mark.parametrize("algorithms", [(), ("SAC", "SAC")])
+def test_algorithms_differ_and_there_is_one_at_least(algorithms):
+    with pytest.raises(ValueError, match="--algorithms must be different"):
+        CompareSettings(algorithms=algorithms)
+
+
+def test_one_agent_has_one_algorithm():
+    with pytest.raises(ValueError, match="--algorithms must be one for `ncs train`"):
+        train(TrainSettings(algorithms=("PPO", "SAC")))
 
 
 def result(returns, violations, interventions=0, index=0):
@@ -124,7 +162,7 @@ def result(returns, violations, interventions=0, index=0):
         Episode(i, 10, r, v, 2 * v, interventions, True, 0.5)
         for i, (r, v) in enumerate(zip(returns, violations, strict=True))
     ]
-    return RunResult("arm", index, 100, 4, 20, [], episodes)
+    return RunResult("unshielded", index, 100, 4, 20, [], episodes)
 
 
 def summary_of_runs(runs, fixed_policy=False):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 
 import pytest
 
@@ -28,6 +29,7 @@ def test_help_fits_into_80_columns_and_every_command_has_a_place_for_its_files(c
     assert usage.startswith("usage: ")  # tyro's own, which may be longer
     assert [line for line in lines if len(line) > WIDTH] == []
     assert any("--out" in line for line in lines)
+    assert not re.search(r"docs/|\.md\b", " ".join(lines))  # files that a wheel does not have
 
 
 @pytest.mark.parametrize(("arguments", "code"), [(["--help"], 0), ([], 2)])

@@ -83,7 +83,6 @@ def attacked(value, text, path=()):
 
 TEXTS = {
     ("settings", "env"),
-    ("settings", "algo"),
     ("settings", "certificate"),
     ("certificate",),
     ("plant", "fingerprint"),

@@ -37,6 +37,7 @@ def layers(env):
         ("psf+penalty", "psf", "trained"),
         ("lookahead", "lookahead", "trained"),
         ("lookahead at test", "lookahead", "trained"),
+        ("SAC lookahead at test", "lookahead", "trained"),
         ("mpc:20+psf:tube", "psf:tube", "mpc:20"),
         ("shield at test", "boundary", "trained"),
         ("trusting at test", "trusting", "trained"),

@@ -31,7 +31,7 @@ def finished(command, settings, file="summary.json"):
     [
         ("compare", CompareSettings, {"seed": 1}, r"\(seed 0, now 1\)"),
         ("compare", CompareSettings, {"channel": {"loss": 0.5}}, r"\(channel {}, now {'loss': 0.5}\)"),
-        ("compare", CompareSettings, {"seed": 1, "algo": "SAC", "steps": 1, "episodes": 1}, r"; \.\.\.\)"),
+        ("compare", CompareSettings, {"seed": 1, "algorithms": ("SAC",), "steps": 1, "episodes": 1}, r"; \.\.\.\)"),
         ("train", TrainSettings, {"arm": "unshielded"}, "arm"),
         ("train", TrainSettings, {"steps": 3}, "steps"),
         ("sweep", SweepSettings, {"episodes": 3}, "episodes"),

@@ -9,7 +9,7 @@ import pytest
 from agents.loop import LoopConfig
 from experiments.analysis.episodes import arm_summary
 from experiments.commands.compare import CompareSettings
-from experiments.report.text_tables import scenario_text, summary_text
+from experiments.report.text_tables import summary_text
 from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import other_scenarios, scenario_named, under, worse_channel
 from experiments.runs.output_folder import load, save
@@ -90,11 +90,11 @@ def test_summary_and_table_have_a_block_per_scenario():
     assert {name: arm["shielded"] for name, arm in arms.items()} == dict.fromkeys(modes, False) | {"lqr+shielded": True}
     pushed = arms["lqr+trusting"]["conditions"]["worst-case disturbance"]
     assert pushed["eval_violation_steps"] > arms["lqr+trusting"]["eval_violation_steps"]
-    text = scenario_text("worst-case disturbance", arms, {})
-    assert text.startswith("worst-case disturbance:")
+    head, text = summary_text(arms, {}).split("\nworst-case disturbance\n")
+    assert head.count("episodes [%]") == 1
+    assert "\nas trained\nlqr " in head
     assert f" {pushed['eval_violation_steps']:,} " in text
-    for printed in (text, summary_text(arms, {})):
-        assert max(map(len, printed.splitlines())) <= 100
+    assert max(map(len, f"{head}\n{text}".splitlines())) <= 80
 
 
 def test_attack_is_as_strong_as_the_contract_allows_and_on_an_ideal_channel_the_network_alone_is_missing():

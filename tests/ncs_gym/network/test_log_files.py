@@ -266,7 +266,7 @@ def test_file_that_is_not_certain_is_refused_in_one_sentence(content, words, wri
     assert len(str(refusal.value)) < 600
     if words.startswith("are [") or "none of Linux" in words or "another host" in words:
         assert "a table with the columns sent and received alone, in seconds" in str(refusal.value)
-        assert "docs/contracts.md has recipes for others" in str(refusal.value)
+        assert 'others are in the documentation under "Contracts and recorded networks"' in str(refusal.value)
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
