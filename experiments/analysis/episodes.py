@@ -11,6 +11,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from agents.hyperparams import ALGORITHMS
 from experiments.analysis.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
 from experiments.runs.arms import Arm, by_arm, is_shield
 from experiments.runs.loops import AS_TRAINED
@@ -64,8 +65,8 @@ def episodes_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
 
 def _of_arm(name: str) -> dict[str, str]:
     """Returns the columns of an arm: its name, and its algorithm if it has one of its own."""
-    algorithm = Arm.of(name).algorithm
-    return {"arm": name} | ({"algorithm": algorithm} if algorithm else {})
+    algorithm = name.partition(" ")[0]
+    return {"arm": name} | ({"algorithm": algorithm} if algorithm in ALGORITHMS else {})
 
 
 def training_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:

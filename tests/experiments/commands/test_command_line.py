@@ -96,7 +96,7 @@ def test_smoke_run_prints_the_table_and_the_files(smoke):
     out, run = smoke
     assert "shielded" in run.stdout
     lines = run.stdout.splitlines()
-    table = lines[next(i for i, line in enumerate(lines) if "training:" in line) :]
+    table = lines[next(i for i, line in enumerate(lines) if line.startswith("training  ")) :]
     assert all(name in {line.split("  ")[0] for line in table} for name in ("unshielded", "lqr+shielded"))
     prose = run.prose
     assert "% of the largest ellipsoid in the box)" in prose

@@ -162,7 +162,7 @@ def result(returns, violations, interventions=0, index=0):
         Episode(i, 10, r, v, 2 * v, interventions, True, 0.5)
         for i, (r, v) in enumerate(zip(returns, violations, strict=True))
     ]
-    return RunResult("unshielded", index, 100, 4, 20, [], episodes)
+    return RunResult("arm", index, 100, 4, 20, [], episodes)
 
 
 def summary_of_runs(runs, fixed_policy=False):
