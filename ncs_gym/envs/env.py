@@ -214,7 +214,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         """Starts an episode.
 
         Args:
-            seed: Seeds `np_random`, the only source of randomness.
+            seed: Seeds `np_random`, the only source of randomness, and the generator of the task that it spawns.
             options: {"state": x0} starts at x0, shape (n,). {"channel": c}, {"downlink": c} give this episode another
                 channel, a `Channel` or a function (rng) -> Channel that draws one. Contract, error set and spaces stay
                 those that the environment was made with: a channel that cannot keep the contract may break it, as ever,
@@ -233,7 +233,8 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         if seed is not None:
             now.process.forget()
         now.give(sources)
-        now.begin(self.np_random, start, fixed, self._begin_task)
+        now.begin(self.np_random, start, fixed)
+        self._task_state = self._task.begin(self._draws_of_task(seed), self.plant)
         info, guard = self._info(no_inputs(self.plant.m), False), self._guard
         if guard is not None:
             guard.begin(now.beginning(self._belief))
@@ -262,7 +263,8 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         self._consistent = False
         guard = self._guard
         u = read[1] if guard is None else guard.input(read[1])
-        inputs, arrived = now.move(self.np_random, u, self._move_task)
+        inputs, arrived = now.move(self.np_random, u)
+        self._task_state = self._task.advance(self._draws_of_task(), self.plant, self._task_state, inputs.applied)
         reward = self._task.reward_one(self.plant, self._task_state, now.state, inputs.applied)
         info = self._info(inputs, arrived, read=read)
         if guard is not None:
@@ -280,12 +282,6 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         if guard is not None:
             guard.tell()
         return observation, reward, terminated, truncated, info
-
-    def _begin_task(self) -> None:
-        self._task_state = self._task.begin(self.np_random, self.plant)
-
-    def _move_task(self, u: np.ndarray) -> None:
-        self._task_state = self._task.advance(self.np_random, self.plant, self._task_state, u)
 
     def request(self, asked: bool = True) -> None:
         """Asks for a sample in the next step, where the channel takes samples on request (docs/requests.md).

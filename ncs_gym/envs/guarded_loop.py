@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.loop import Loop, LoopState
 from ncs_gym.envs.report import Belief, Guard
@@ -39,7 +41,9 @@ class GuardedLoop:
     belief: Belief = setting("belief")
     guard: Guard | None = setting("guard")
 
+    np_random: np.random.Generator  # of gymnasium
     _now: LoopState
+    _task_random: np.random.Generator | None = None
     _belief: Belief
     _guard: Guard | None = None
     # Whether there is an episode that no exception has interrupted.
@@ -54,6 +58,12 @@ class GuardedLoop:
         if self._guard is not None:
             raise ValueError("the environment has a shield already: leave one out, or make an environment for each")
         self._guard, self._consistent = guard, False
+
+    def _draws_of_task(self, seed: int | None = None) -> np.random.Generator:
+        """Returns the task's own generator, so that what a task draws changes nothing in the loop; a seed renews it."""
+        if seed is not None or self._task_random is None:
+            self._task_random = self.np_random.spawn(1)[0]
+        return self._task_random
 
     def _info(self, inputs: Inputs, arrived: Any, counted: Any = None, read: Any = None) -> dict[str, Any]:
         """Returns `info`, and keeps the belief; see `LoopState.report` and `actions_of`."""

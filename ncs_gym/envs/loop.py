@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -177,13 +177,12 @@ class LoopState(CopiedWhole, ABC):
         for links, each in zip(self.links.values(), sources, strict=True):
             links.give(each, chosen)
 
-    def move(self, rng: np.random.Generator, u: np.ndarray, task: Callable[[np.ndarray], None]) -> tuple[Inputs, Any]:
+    def move(self, rng: np.random.Generator, u: np.ndarray) -> tuple[Inputs, Any]:
         """Moves one step on; returns the inputs of the step, and whether a packet arrived, a bool or shape (N,).
 
         Args:
             rng: Source of randomness.
             u: What is decided now, shape (m,) or (m, N) [physical units].
-            task: Moves the task, given the input applied.
         """
         self.moves = self.moves + 1
         inputs = self.downlink.exchange(rng, self.steps, u)
@@ -194,7 +193,6 @@ class LoopState(CopiedWhole, ABC):
             requested = self.requests.decided[0] | inputs.missing
         self.state = self.process.advance(rng, before, inputs.applied, self.steps, self.memory)
         self.worst = self.loop.plant.worst_constraint_values(before, inputs.applied, self.state)
-        task(inputs.applied)
         self.steps = self.steps + 1
         return inputs, self._receive(rng, inputs.applied, requested)
 
@@ -281,7 +279,6 @@ class OneLoop(LoopState):
         rng: np.random.Generator,
         start: np.ndarray | None,
         fixed: np.ndarray | None,
-        task: Callable[[], None],
     ) -> None:
         """Begins an episode.
 
@@ -289,12 +286,10 @@ class OneLoop(LoopState):
             rng: Source of randomness.
             start: Where, shape (n,); None draws it from the initial set.
             fixed: What `read` returned of parameters.
-            task: Begins the task's episode.
         """
         loop, self.moves = self.loop, self.moves + 1
         initial, first = (None, start) if start is not None else (loop.initial_set, self._drawn_start(rng))
         self.state, self.start = self.process.start(rng, first, initial, fixed)
-        task()
         self.memory = self.process.begin(rng)
         for links in self.links.values():
             links.begin(rng)
@@ -352,7 +347,6 @@ class ManyLoops(LoopState):
         mask: np.ndarray,
         starts: np.ndarray | None,
         fixed: np.ndarray | None,
-        task: Callable[[np.ndarray], None],
     ) -> None:
         """Begins episodes where `mask`, shape (N,), says so.
 
@@ -361,7 +355,6 @@ class ManyLoops(LoopState):
             mask: Where.
             starts: The states, shape (N, n); None draws them from the initial set.
             fixed: What `read` returned of parameters.
-            task: Begins the task's episodes, given their mask.
         """
         loop, rows, self.moves = self.loop, np.flatnonzero(mask), self.moves + mask
         count = len(rows)
@@ -369,7 +362,6 @@ class ManyLoops(LoopState):
         first_errors = self.process.first_error(rng, count)
         initial, states = (loop.initial_set, first_states) if starts is None else (None, starts[mask].T)
         states, known = self.process.start_many(rng, states, initial, mask, fixed)
-        task(mask)
         memory = self.process.begin(rng, count)
         channels, commands = self.channels.begin(rng, rows), self.downlinks.begin(rng, rows)
         if count == self.size or not (self.channels.is_plain and self.downlinks.is_plain):

@@ -139,6 +139,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         super().reset(seed=seed)
         if seed is not None:
             self._now.process.forget()
+        self._draws_of_task(seed)
         chosen = np.flatnonzero(mask).tolist()
         sources = self._now.drawn(sources, self.np_random, chosen)
         if not (self._consistent or mask.all()):
@@ -177,8 +178,10 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         """Returns what a step returns in which no episode begins, given the inputs proposed, shape (m, N)."""
         now, guard = self._now, self._guard
         u = u if guard is None else guard.input(u)
-        inputs, arrived = now.move(self.np_random, u, self._move_task)
-        reward = self._task.reward_many(self.plant, self._task_state, now.state, inputs.applied)
+        inputs, arrived = now.move(self.np_random, u)
+        applied = inputs.applied
+        self._task_state = self._task.advance_many(self._draws_of_task(), self.plant, self._task_state, applied)
+        reward = self._task.reward_many(self.plant, self._task_state, now.state, applied)
         info = self._info(inputs, arrived)
         if guard is not None:
             guard.observe(self._belief)
@@ -200,15 +203,14 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         `fixed` is what the process read of the parameters of a family, (N, k).
         """
         now = self._now
-        now.begin(self.np_random, mask, starts, fixed, self._begin_task)
+        now.begin(self.np_random, mask, starts, fixed)
+        begun = self._task.begin_many(self._draws_of_task(), self.plant, int(np.count_nonzero(mask)))
+        self._task_state = np.array(begun) if mask.all() else with_columns(self._task_state, mask, begun)
         info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         if self._guard is not None:
             self._guard.begin(now.beginning(self._belief, np.flatnonzero(mask)), mask)
             info |= self._guard.info()
         return self._observation(), info
-
-    def _move_task(self, u: np.ndarray) -> None:
-        self._task_state = self._task.advance_many(self.np_random, self.plant, self._task_state, u)
 
     def request(self, asked: Any = True) -> None:
         """Asks for samples in the next step, in all environments or where a mask (N,) says so; see `NCSEnv.request`.
@@ -265,10 +267,6 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
             ValueError: If one is not finite or the shape is wrong.
         """
         return read_actions(self.plant, actions, self.num_envs)[1]
-
-    def _begin_task(self, mask: np.ndarray) -> None:
-        begun = self._task.begin_many(self.np_random, self.plant, int(np.count_nonzero(mask)))
-        self._task_state = np.array(begun) if mask.all() else with_columns(self._task_state, mask, begun)
 
     def _one_each(self, value: Any, name: str) -> list[Channel] | None:
         """Returns a channel that is given for all environments, or for each, as a list of N; None for None."""

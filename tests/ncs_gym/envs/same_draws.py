@@ -85,7 +85,7 @@ class ScriptedEnv(NCSEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple:
         """Begins in the state of the episode that its environment of the vector has just begun."""
         many, index = self.many, self.index
-        self.np_random = np.random.default_rng(0)
+        self.np_random, self._task_random = np.random.default_rng(0), None
         links = {"channel": many.episode_channels[index], "downlink": many.episode_downlinks[index]}
         super().reset(options={"state": many._now.state[:, index], **links})
         if np.isnan(many.starts[index]).any():
@@ -102,7 +102,7 @@ class ScriptedEnv(NCSEnv):
         if self.downlink is not None:
             states = many._now.downlink._channel_state._loss_state
             self._now.downlink.in_flight._loss_state = LossState(*(kept[index] for kept in states))
-        self.np_random, self._now.violations = ScriptedGenerator(), 0.0
+        self.np_random, self._task_random, self._now.violations = ScriptedGenerator(), ScriptedGenerator(), 0.0
         info = self._info(no_inputs(self.plant.m), arrived=False)
         if self.guard is not None:
             self.guard.begin(self._now.beginning(self._belief))
@@ -127,6 +127,7 @@ class ScriptedEnv(NCSEnv):
         self._now.process.disturbance_now = process.disturbance_now[:, self.index]
         self._now.process.noise_now = process.noise_now[:, self.index]
         self.np_random.numbers = [drawn[..., self.index] for drawn in rng.drawn]
+        self._task_random.numbers = [drawn[..., self.index] for drawn in self.many._task_random.drawn]
 
 
 def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
@@ -138,12 +139,13 @@ def scalar_versions(many: NCSVectorEnv) -> list[ScriptedEnv]:
     many._now.process.process = moving  # with the members of families that the reset has drawn
     many._now.process.noise_now = np.zeros((many.plant.p, many.num_envs))
     many.np_random = rng = RecordingGenerator(many.np_random)
+    many._task_random = of_task = RecordingGenerator(many._task_random)
     begin = many._begin
 
     def begin_unnoticed(*arguments: Any) -> Any:
-        rng.notes = False
+        rng.notes = of_task.notes = False
         begun = begin(*arguments)
-        rng.notes = True
+        rng.notes = of_task.notes = True
         return begun
 
     many._begin = begin_unnoticed
@@ -307,6 +309,7 @@ def compare(
             actions = np.sign(infos["estimate"] @ push.T @ many.plant.B + 1e-12)
         actions, episodes = actions.astype(np.float32), many.episodes.copy()
         many.np_random.drawn = []
+        many._task_random.drawn = []
         asked = np.zeros(many.num_envs, np.bool_)
         if many.channel.on_request:
             asked = rng.random(many.num_envs) < 0.2

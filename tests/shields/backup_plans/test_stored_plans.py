@@ -44,7 +44,7 @@ def test_a_step_without_the_guard_drops_every_plan(many, goes_on):
     _, info = many.reset(seed=0, options={"state": np.random.default_rng(0).uniform(-0.9, 0.9, (COUNT, n))})
     assert info["shield_plan_length"].any()
     env = many.unwrapped
-    env._now.move(env.np_random, np.zeros((m, COUNT)), env._move_task)
+    env._now.move(env.np_random, np.zeros((m, COUNT)))
     untouched = np.ones(COUNT, np.bool_)
     if goes_on == "step":
         *_, info = many.step(push)

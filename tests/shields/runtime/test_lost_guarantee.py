@@ -36,7 +36,7 @@ def lose(shield, seed=0):
     """Begins an episode in which the loop moves without its guard: nothing is proved till the next."""
     shield.reset(seed=seed)
     env = shield.unwrapped
-    env._now.move(env.np_random, np.zeros(np.shape(env.belief.applied)), env._move_task)
+    env._now.move(env.np_random, np.zeros(np.shape(env.belief.applied)))
 
 
 def said(call):
@@ -99,7 +99,7 @@ def test_one_environment_of_many_is_enough_and_says_it_in_its_own_episode():
 def test_guarantee_lost_in_the_last_step_of_an_episode_is_said_though_the_next_has_begun(monkeypatch):
     env = vector_env(2, plant=PLANT, max_episode_steps=1, autoreset_mode=AutoresetMode.SAME_STEP)
     shield, move = vector_shield(env, certificate_of(PLANT)), env._now.move
-    monkeypatch.setattr(env._now, "move", lambda rng, u, task: move(rng, 0.5 * u, task))
+    monkeypatch.setattr(env._now, "move", lambda rng, u: move(rng, 0.5 * u))
     shield.reset(seed=0)
     (text, _), *others = said(lambda: shield.step(np.full(shield.action_space.shape, 0.01, np.float32)))
     assert OTHER_INPUT in text

@@ -163,7 +163,7 @@ def test_a_loop_that_moves_without_its_guard_proves_nothing_until_the_next_reset
     for _ in range(2):
         assert np.all(shield.reset(seed=0)[1]["shield_guaranteed"])
         assert np.all(shield.step(action)[-1]["shield_guaranteed"])
-        env._now.move(env.np_random, np.zeros(np.shape(env.belief.applied)), env._move_task)
+        env._now.move(env.np_random, np.zeros(np.shape(env.belief.applied)))
         for _ in range(3):
             info = shield.step(action)[-1]
             assert np.all(info["shield_reason"] == OTHER_STEPS)
@@ -178,7 +178,7 @@ def test_another_input_than_the_one_decided_is_seen(made, monkeypatch):
     move = env._now.move
     assert np.all(shield.step(action)[-1]["shield_guaranteed"])
     with monkeypatch.context() as patch:
-        patch.setattr(env._now, "move", lambda rng, u, task: move(rng, 0.9 * u, task))
+        patch.setattr(env._now, "move", lambda rng, u: move(rng, 0.9 * u))
         assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_INPUT)
     assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_INPUT)
     assert np.all(shield.reset()[1]["shield_guaranteed"])
@@ -196,7 +196,7 @@ def test_an_input_that_is_decided_and_not_applied_ends_the_claim(made, mode):
     assert np.all(shield.reset()[1]["shield_guaranteed"])
     assert np.all(shield.step(action)[-1]["shield_guaranteed"])
     u = env.guard.input(np.zeros(np.shape(env.belief.applied)))
-    env._now.move(env.np_random, u, env._move_task)
+    env._now.move(env.np_random, u)
     assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_STEPS)
 
 
@@ -207,7 +207,7 @@ def test_an_input_without_its_step_ends_the_claim_also_where_others_begin(moves)
     shield.reset(seed=0)
     u = env.guard.input(np.zeros((1, 2)))
     if moves:
-        env._now.move(env.np_random, u, env._move_task)
+        env._now.move(env.np_random, u)
     info = shield.reset(options={"reset_mask": np.array([True, False])})[1]
     assert info["shield_reason"].tolist() == ["", OTHER_STEPS]
     info = shield.step(np.zeros((2, 1)))[-1]
