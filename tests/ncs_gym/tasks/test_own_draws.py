@@ -25,7 +25,7 @@ class Restless(Regulation):
 def test_loop_is_the_same_whatever_a_task_draws(make):
     seen = []
     for task in (None, Restless()):
-        env = make("ncs_gym/Convoy-v0", task=task)
+        env = make("ncs_gym/TruckTrailerCruise-v0", task=task)
         infos = [env.reset(seed=5)[1]] + [env.step(np.zeros(env.action_space.shape))[4] for _ in range(30)]
         infos.append(env.reset()[1])
         seen.append(
