@@ -22,7 +22,7 @@ NEWEST := $(VENV)-newest
 ADDRESS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help compare study pretrained test test-other-processor test-lowest test-newest coverage coverage-report test-slow test-slow-part mutants lint types benchmark \
+.PHONY: help compare suite pretrained test test-other-processor test-lowest test-newest coverage coverage-report test-slow test-slow-part mutants lint types benchmark \
 	example-times docs words audit dist address clean
 
 help: ## this list
@@ -32,10 +32,10 @@ help: ## this list
 compare: $(INSTALLED) ## agents with and without a shield, compared (OUT=runs/compare)
 	$(BIN)/ncs compare --out $(OUT)
 
-# Runs that runs/study has already are kept, so that it can be done in parts.
-study: $(INSTALLED) ## the whole study, and the pages of results
-	$(BIN)/python -m benchmarks.study compare
-	$(BIN)/python -m benchmarks.study pages
+# Runs that runs/suite has already are kept, so that it can be done in parts.
+suite: $(INSTALLED) ## the whole benchmark, and its page
+	$(BIN)/python -m benchmarks.suite measure
+	$(BIN)/python -m benchmarks.suite pages
 
 test: $(INSTALLED) ## the tests
 	$(BIN)/python -m pytest -n auto --dist worksteal $(TEST_FLAGS)
@@ -73,7 +73,7 @@ test-slow: $(INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks,
 
 # What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit, the study and a record as the
 # pages have them, hints, the same bits in every process, and what worker processes do.
-SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_audit.py tests/test_study.py \
+SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_audit.py tests/test_suite.py \
 	tests/experiments/commands/test_requirements.py \
 	tests/test_published_plants.py \
 	tests/shields/synthesis/test_hints.py::test_a_contract_is_named_where_a_stable_plant_has_none \

@@ -1,10 +1,9 @@
 """How good agents are, and the searches for their settings: `python -m benchmarks.learning COMMAND`.
 
-Commands: tune, tuned, pretrained, linear, tune-arms.
+Commands: tune, pretrained, tune-arms.
 
-Behind the same shield, agents are compared with what needs no training: regulators, with and without an estimate of the
-disturbance. Seeds are those of `ncs compare` with `--seed 1000000` for searches, 2000000 for tables and 3000000 for the
-agents of the package, so that neither a study (`--seed 0`) nor a table has what was searched on.
+Seeds are those of `ncs compare` with `--seed 1000000` for searches and 3000000 for the agents of the
+package, so that the benchmark (`--seed 0`, `--seed 1`) has nothing that was searched on.
 """
 
 from __future__ import annotations
@@ -28,34 +27,26 @@ from agents import (
     tuned_hyperparams,
     tuned_steps,
 )
-from agents import pretrained as packaged_agent
 from agents.evaluation import Policy
 from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
 from agents.loop import LagrangianSettings
 from benchmarks.commands import run, some_of
-from benchmarks.study import ENVS, REGULATED, TRAINED
-from benchmarks.study_figures import ATTACKED
+from benchmarks.suite import ENTRIES, REGULATED, TASKS, rows_of
 from benchmarks.timing import timed
-from experiments.analysis.statistics import mean_interval
 from experiments.baselines import RegulatorWeights, controller
 from experiments.baselines.controllers import OBSERVER
 from experiments.commands.compare import CompareSettings
 from experiments.runs.arms import Arm
-from experiments.runs.loops import AS_TRAINED, under
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import registered_ids
 from shields import Certificate, certificate_for
 from shields.certificate import Fallback
 
 ROOT = Path(__file__).resolve().parent.parent
-SEARCH_SEED, TABLE_SEED, PACKAGE_SEED = 1_000_000, 2_000_000, 3_000_000
+SEARCH_SEED, PACKAGE_SEED = 1_000_000, 3_000_000
 EPISODES = 200
-# Few that regulators are tuned on.
-TUNING_EPISODES = 12
-# Three in which the network decides and a disturbance persists, and two in which neither is so.
-LINEAR_ENVS = (*ENVS, "ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0")
-# Arms beyond the study's.
-OBSERVING = tuple(f"lqr{OBSERVER}+{each}" for each in ("shielded", "lookahead"))
+# Arms of the benchmark that are tuned, each once; other cost limits go with what was tuned for the first one.
+TUNED = tuple(dict.fromkeys(entry.arm for entry in ENTRIES.values() if not entry.arm.startswith("lagrangian:")))
 # Steps of a training; where more were seen to help, four times as many.
 STEPS, MORE_STEPS = 150_000, 600_000
 LONGER = ("ncs_gym/CartPole-v0", "ncs_gym/CartPoleTwoWay-v0", "ncs_gym/CartPoleNonlinear-v0")
@@ -101,7 +92,6 @@ class Results:
         return self._known[text]
 
 
-REGULATORS = ("lqr", f"lqr{OBSERVER}", "mpc", f"mpc{OBSERVER}")
 # Twelve weights are tried of every regulator.
 GRID = [{"effort": effort, "state": state} for effort, state in product((0.003, 0.03, 0.3, 3.0), (0.003, 0.03, 0.3))]
 OBSERVED = [
@@ -119,16 +109,6 @@ def regulated(loop: LoopConfig, name: str, weights: dict[str, Any]) -> Policy:
     """A regulator with some weights."""
     env = ncs_env(loop.single())
     return controller(name, env, Fallback.of_gain(np.zeros((env.plant.m, env.plant.n))), 0, RegulatorWeights(**weights))
-
-
-def best_weights(results: Results, loop: LoopConfig, name: str, episodes: int) -> dict[str, Any]:
-    """The weights of a regulator with the highest mean return on the seed of the searches."""
-
-    def tried(weights: dict[str, Any]) -> float:
-        return mean_return(loop, regulated(loop, name, weights), SEARCH_SEED, episodes)
-
-    tries = grid(name)
-    return max(tries, key=lambda each: results.of([loop.env, name, episodes, each], lambda: tried(each)))
 
 
 TUNED_PPO = ROOT / "agents" / "tuned" / "ppo.json"
@@ -218,56 +198,6 @@ def tune(
         TUNED_PPO.write_text(json.dumps(known, indent=1) + "\n")
 
 
-def tuned(
-    env: Sequence[str] = (), seeds: int = 5, defaults: bool = False, out: Path = Path("runs/tuned_agents.jsonl")
-) -> None:
-    """Mean return per episode behind the same shield (mode project): tuned agents against what needs no training.
-
-    The tuned agent has the hyperparameters and steps of agents/tuned; with `--defaults` there is one with the defaults
-    and 150,000 steps, too. Every policy plays 200 episodes per seed, the same for all policies; intervals are Student's
-    over seeds. The last line of an environment pairs the tuned agent with the best of those that need no training, seed
-    by seed. What was measured is kept in OUT.
-    """
-    results, agent = Results(out), "tuned agent"
-    print(f"{seeds} seeds, {EPISODES} episodes each\n\n| environment | policy | mean return |\n|---|---|---|")
-    for env_id in env or registered_ids():
-        loop = shielded_loop(env_id)
-
-        def measured(name: str, make: Callable[[int], Policy], index: int, loop: LoopConfig = loop) -> float:
-            training_seed, evaluation_seed = seeds_of(TABLE_SEED, index)
-            return results.of([loop.env, name, index], lambda: mean_return(loop, make(training_seed), evaluation_seed))
-
-        returns = {
-            name: [measured(name, make, index) for index in range(seeds)]
-            for name, make in _policies(loop, defaults, results).items()
-        }
-        lines = [f"| `{env_id}` | {name} | {with_interval(values)} |" for name, values in returns.items()]
-        means = {name: float(np.mean(values)) for name, values in returns.items() if "agent" not in name}
-        best = max(means, key=lambda name, means=means: means[name])
-        gain = [one - other for one, other in zip(returns[agent], returns[best], strict=True)]
-        print("\n".join([*lines, f"| `{env_id}` | {agent} - {best} | {with_interval(gain, '+')} |"]), flush=True)
-
-
-def _policies(loop: LoopConfig, with_defaults: bool, results: Results) -> dict[str, Callable[[int], Policy]]:
-    """What makes the policy of a seed, by name."""
-    env, hyperparams, regulator = ncs_env(loop.single()), tuned_hyperparams(loop.env), f"lqr{OBSERVER}"
-    assert loop.shield is not None
-    certified, steps = loop.shield.certificate.fallback, tuned_steps(loop.env) or STEPS
-    weights = best_weights(results, loop, regulator, TUNING_EPISODES)
-    found: dict[str, Callable[[int], Policy]] = {"tuned agent": lambda seed: trained(loop, hyperparams, steps, seed)}
-    if with_defaults:
-        found["agent, default settings"] = lambda seed: trained(loop, {}, STEPS, seed)
-    for name in ("random", "K x_hat"):
-        found[name] = lambda seed, name=name: controller(name, env, certified, seed)
-    return found | {regulator: lambda seed: regulated(loop, regulator, weights)}
-
-
-def with_interval(values: Sequence[float], sign: str = "", digits: int = 2) -> str:
-    """The mean of some values with Student's interval."""
-    low, high = mean_interval(values) or (float("nan"),) * 2
-    return "{:{}} [{:{}}, {:{}}]".format(*(x for v in (np.mean(values), low, high) for x in (v, f"{sign}.{digits}f")))
-
-
 def pretrained(env: Sequence[str] = (), out: Path = ROOT / "agents" / "trained") -> None:
     """Trains the small agents that come with the package, one per registered id, behind the shield (mode project).
 
@@ -295,64 +225,6 @@ def _train_and_save(env_id: str, folder: Path) -> str:
     return f"{env_id}: return {mean:.2f}, {violations} violating steps, {size / 1e3:.0f} kB"
 
 
-def linear(
-    env: Sequence[str] = LINEAR_ENVS,
-    regulators: Annotated[Sequence[str], some_of(REGULATORS)] = REGULATORS,
-    tuning_episodes: int = TUNING_EPISODES,
-    episodes: int = 100,
-    out: Path = Path("runs/linear.jsonl"),
-) -> None:
-    """The agents of the package beside regulators, behind the same shield, on the same episodes.
-
-    Of every regulator `grid` has twelve weights; those with the highest mean return of --tuning-episodes behind the
-    shield (mode project) play --episodes on another seed, as the agents do: alone and behind both modes of the shield,
-    as trained and attacked. "alone" and "shielded" have violating episodes of both scenarios, the latter of both modes;
-    the others have the return as trained, with Student's interval over episodes, and the share of overridden steps. The
-    last column has what a regulator returns more than the agent in mode lookahead, episode by episode. What was
-    measured is kept in OUT.
-    """
-    results, (_, seed) = Results(out), seeds_of(TABLE_SEED, 0)
-    print("| task | policy | alone | `project` | `lookahead` | shielded | less the agent's |")
-    print("|---|---|---|---|---|---|---|")
-    of_agent = np.zeros(episodes)
-    for env_id in env:
-        bare, shielded = LoopConfig(env=env_id), shielded_loop(env_id)
-        assert shielded.shield is not None
-        loops = {"alone": bare, "project": shielded}
-        loops["lookahead"] = replace(shielded, shield=replace(shielded.shield, mode="lookahead"))
-        for name in ("agent", *regulators):
-            weights = None if name == "agent" else best_weights(results, shielded, name, tuning_episodes)
-
-            def played(key: str, scenario: str, name: str = name, weights: Any = weights, own: Any = loops) -> Any:
-                def measure() -> list[list[float]]:
-                    policy = _packaged(own[key].env) if weights is None else regulated(own[key], name, weights)
-                    found = evaluate(under(scenario, own[key]), policy, episodes, seed).episodes
-                    return [[e.episode_return, e.violation_steps, e.interventions, e.steps] for e in found]
-
-                return np.array(results.of([own[key].env, name, weights, key, scenario, episodes], measure))
-
-            rates = [100.0 * np.mean(played("alone", each)[:, 1] > 0) for each in (AS_TRAINED, ATTACKED)]
-            cells = [f"{rates[0]:.0f} %, {rates[1]:.0f} %"]
-            for mode in ("project", "lookahead"):
-                found = played(mode, AS_TRAINED)
-                share = 100.0 * found[:, 2].sum() / found[:, 3].sum()
-                cells.append(f"{with_interval(found[:, 0].tolist(), digits=1)} ({share:.1f} %)")
-            every = [played(mode, each)[:, 1] for mode in ("project", "lookahead") for each in (AS_TRAINED, ATTACKED)]
-            cells.append(f"{np.count_nonzero(every)} of {np.size(every)}")
-            if name == "agent":
-                of_agent = played("lookahead", AS_TRAINED)[:, 0]
-                cells.append("")
-            else:
-                gain = played("lookahead", AS_TRAINED)[:, 0] - of_agent
-                cells.append(with_interval(gain.tolist(), "+", digits=1))
-            print(f"| {env_id.rpartition('/')[2]} | {name} | {' | '.join(cells)} |", flush=True)
-
-
-def _packaged(env_id: str) -> Policy:
-    agent = packaged_agent(env_id)
-    return lambda observations, infos: agent.act(observations)
-
-
 TUNED_ARMS = ROOT / "experiments" / "baselines" / "tuned.json"
 CANDIDATES: tuple[dict[str, Any], ...] = (
     {},
@@ -366,18 +238,18 @@ MORE: dict[str, tuple[dict[str, Any], ...]] = {
     "lagrangian": ({"lagrangian": {"learning_rate": 0.5}}, {"lagrangian": {"multiplier": 10.0}}),
 }
 OTHERS = ({"hyperparams": {"learning_rate": "lin_0.001"}}, {"hyperparams": {"policy_kwargs": {"log_std_init": -1.5}}})
-# Steps of a training, those of the published study.
+# Steps of a training in this search.
 TRAINING_STEPS = 60_000
 
 
 def tune_arms(
-    env: Sequence[str] = ENVS,
-    arms: Annotated[Sequence[str], some_of((*TRAINED, *REGULATED, *OBSERVING))] = (*TRAINED, *REGULATED),
+    tasks: Annotated[Sequence[str], some_of(TASKS)] = TASKS,
+    arms: Annotated[Sequence[str], some_of(TUNED)] = TUNED,
     episodes: int = 24,
     out: Path = Path("runs/tuned_arms.jsonl"),
     write: bool = False,
 ) -> None:
-    """Tunes every arm of the study by itself, each behind its own filter, with the same budget.
+    """Tunes every arm of the benchmark by itself, each behind its own filter, with the same budget.
 
     Of a regulator a grid of weights is tried, of an agent `CANDIDATES` of PPO's hyperparameters and then, with the best
     of the first three, two more: prices of a violation, settings of PPO-Lagrangian, or hyperparameters where an arm has
@@ -388,14 +260,14 @@ def tune_arms(
     """
     results = Results(out)
     chosen: dict[str, dict[str, dict[str, Any]]] = json.loads(TUNED_ARMS.read_text("utf-8"))
-    for env_id in env:
-        loop = LoopConfig(env=env_id)
+    for task in tasks:
+        loop, needed = LoopConfig(env=f"ncs_gym/{task}"), {ENTRIES[name].arm for name in rows_of(task)}
         single = ncs_env(loop.single())
         certificate = certificate_for(single.plant, single.certificate_contract)
 
         def best(arm: str, tries: list[dict[str, Any]], loop: LoopConfig = loop, own: Certificate = certificate) -> Any:
             """Returns what gave the highest mean return, and prints it."""
-            is_trained = arm in TRAINED
+            is_trained = arm not in REGULATED
             number, measure = (4 * episodes, _trained_arm) if is_trained else (episodes, _regulated_arm)
             returns = [
                 results.of([loop.env, arm, number, each], lambda each=each: measure(loop, arm, own, each, number))
@@ -406,8 +278,8 @@ def tune_arms(
             print(f"{loop.env} {arm}: {max(returns):.1f} with {found}, of {shown}", flush=True)
             return found
 
-        for arm in arms:
-            if arm not in TRAINED:
+        for arm in (each for each in arms if each in needed):
+            if arm in REGULATED:
                 found = best(arm, grid(arm))
             else:
                 price = PRICES if arm == "penalized" else {}
@@ -417,7 +289,7 @@ def tune_arms(
                     for each in MORE.get(arm, OTHERS)
                 ]
                 found = best(arm, [found, *more])
-            chosen.setdefault(env_id, {})[arm] = found
+            chosen.setdefault(loop.env, {})[arm] = found
     if write:
         TUNED_ARMS.write_text(json.dumps(chosen, indent=1) + "\n", "utf-8")
 
@@ -440,7 +312,7 @@ def _trained_arm(loop: LoopConfig, arm: str, certificate: Certificate, tried: di
     return mean_return(evaluated, trained(training, hyperparams, TRAINING_STEPS, SEARCH_SEED), SEARCH_SEED, episodes)
 
 
-COMMANDS = (tune, tuned, pretrained, linear, tune_arms)
+COMMANDS = (tune, pretrained, tune_arms)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

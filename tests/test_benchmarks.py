@@ -66,17 +66,15 @@ def test_code_is_counted_by_folder_and_data_without_what_is_proved_or_trained(mo
     assert not {"agent.json", "CSTR-v0.json"} & names
 
 
-def test_table_of_regulators_pairs_them_with_the_packaged_agent(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(learning, "grid", lambda arm: [{"effort": 0.03, "state": 0.003}])
-    given = {"env": ("ncs_gym/CSTR-v0",), "regulators": ("lqr:observer",), "tuning_episodes": 1}
-    learning.linear(**given, episodes=4, out=tmp_path / "found.jsonl")
+def test_search_chooses_the_weights_that_return_most_and_measures_nothing_twice(tmp_path, monkeypatch, capsys):
+    tries = [{"effort": effort, "state": 0.003, "disturbance": 0.2} for effort in (3.0, 0.03)]
+    monkeypatch.setattr(learning, "grid", lambda arm: tries)
+    given = {"tasks": ("CSTR-v0",), "arms": ("lqr:observer",), "episodes": 2, "out": tmp_path / "found.jsonl"}
+    learning.tune_arms(**given)
     first = capsys.readouterr().out
-    agent, observer = ([cell.strip() for cell in line.split("|")[1:-1]] for line in first.splitlines()[2:])
-    assert [agent[1], observer[1]] == ["agent", "lqr:observer"]
-    assert agent[5] == observer[5] == "0 of 16"
-    gain, returns = float(observer[6].split()[0]), [float(row[4].split()[0]) for row in (agent, observer)]
-    assert gain == pytest.approx(returns[1] - returns[0], abs=0.11)
-    assert gain > 2.0
-    monkeypatch.setattr(learning, "evaluate", None)  # what was measured is not measured again
-    learning.linear(**given, episodes=4, out=tmp_path / "found.jsonl")
+    best, worse, better = re.search(r"observer: ([\d.]+) with .*, of ([\d.]+), ([\d.]+)$", first, re.MULTILINE).groups()
+    assert float(worse) < float(better) == float(best)
+    assert str(tries[1]) in first
+    monkeypatch.setattr(learning, "evaluate", None)
+    learning.tune_arms(**given)
     assert capsys.readouterr().out == first

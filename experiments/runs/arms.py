@@ -29,7 +29,7 @@ _SHIELD_MODES = tuple(mode for mode in MODES if mode != "monitor")
 # What acts where no agent is trained.
 _POLICIES = (*CONTROLLERS, *REGULATORS, "untrained", PRETRAINED)
 _KNOWN_ARMS = (
-    "unshielded, monitor, penalized[:WEIGHT], lagrangian, FILTER, FILTER+penalty, 'FILTER at test', POLICY and "
+    "unshielded, monitor, penalized[:WEIGHT], lagrangian[:LIMIT], FILTER, FILTER+penalty, 'FILTER at test', POLICY and "
     f"POLICY+FILTER, with FILTER one of shielded[:MODE], lookahead, trusting[:MARGIN], psf[:MARGIN], psf:tube and "
     f"POLICY one of untrained, {PRETRAINED}, {', '.join(CONTROLLERS)}, lqr[:observer], mpc[:observer], "
     f"mpc[:MARGIN] (modes: {', '.join(_SHIELD_MODES)}; margins in percent: {', '.join(map(str, MARGINS))})"
@@ -51,6 +51,7 @@ class Arm:
         penalizes_violations: Whether the training reward is reduced per violating step.
         violation_weight: Price of a violating step; None for that of the settings.
         adapts_penalty: Whether that price is adapted during training.
+        cost_limit: Of PPO-Lagrangian; None for that of the settings.
         filters_training: Whether shield or filter act in training too.
         algorithm: Algorithm that trains the agents, the first word of the name; empty for that of the settings.
     """
@@ -62,6 +63,7 @@ class Arm:
     penalizes_violations: bool = False
     violation_weight: float | None = None
     adapts_penalty: bool = False
+    cost_limit: float | None = None
     filters_training: bool = True
     algorithm: str = ""
 
@@ -112,7 +114,8 @@ class Arm:
         if not self.filters_training:
             training = loop
         if self.adapts_penalty:
-            training = replace(training, lagrangian=settings.lagrangian)
+            limit = settings.lagrangian.cost_limit if self.cost_limit is None else self.cost_limit
+            training = replace(training, lagrangian=replace(settings.lagrangian, cost_limit=limit))
         elif self.penalizes_violations:
             given = self.violation_weight
             training = replace(training, violation_penalty=settings.violation_penalty if given is None else given)
@@ -144,6 +147,8 @@ def _parsed(text: str, mode: str) -> Arm:
     kind, colon, weight = text.partition(":")
     if kind == "penalized" and (not colon or _is_weight(weight)):
         return Arm(text, penalizes_violations=True, violation_weight=float(weight) if colon else None)
+    if kind == "lagrangian" and _is_weight(weight):
+        return Arm(text, penalizes_violations=True, adapts_penalty=True, cost_limit=float(weight))
     name = text.replace("-", " ")
     alone = {
         "unshielded": Arm(name),
@@ -225,7 +230,7 @@ def run_of_arm(
         settings = replace(settings, algorithms=(arm.algorithm,))
     hyperparams = settings.all_hyperparams
     if arm.is_trained and getattr(settings, "tuned_arms", False):
-        own = dict(tuned_training(loop.env, arm.name))
+        own = dict(tuned_training(loop.env, "lagrangian" if arm.adapts_penalty else arm.name))
         hyperparams = with_changes(hyperparams, own.pop("hyperparams", {}))
         if "lagrangian" in own:
             own["lagrangian"] = replace(settings.lagrangian, **own["lagrangian"])

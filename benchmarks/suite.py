@@ -1,0 +1,514 @@
+"""The benchmark of docs/benchmark.md, tasks x arms x blocks of seeds: `python -m benchmarks.suite COMMAND`.
+
+Commands: measure, replicate, pages.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import sqrt
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from scipy.stats import sem, t
+
+from agents.agent_file import AGENT_FILES
+from agents.evaluation import Policy, evaluate
+from agents.loop import LoopConfig
+from benchmarks.commands import run, some_of
+from benchmarks.suite_figures import suite_figures
+from experiments.analysis.episodes import episodes_table, training_table
+from experiments.analysis.statistics import CONFIDENCE, clopper_pearson
+from experiments.backends.execution import results_of
+from experiments.commands.compare import CompareSettings
+from experiments.runs.arms import run_of_arm
+from experiments.runs.loops import AS_TRAINED, certificate_of, loop_config, registered_env, under
+from experiments.runs.provenance import versions
+from experiments.runs.training_run import RunResult, TrainingRun
+from experiments.settings import Assignments
+from experiments.terminal import text_table
+from ncs_gym import Channel, ChannelContract
+
+ROOT = Path(__file__).resolve().parents[1]
+# Where the numbers are kept, and the page that shows them.
+NUMBERS, PAGE = Path("docs/results.json"), Path("docs/benchmark.md")
+# Tasks in which the network decides, and others.
+NETWORK_TASKS = ("CSTR-v0", "Convoy-v0", "LaneKeeping-v0")
+OTHER_TASKS = ("TruckTrailerCruise-v0", "TruckTrailer-v0", "BatchReactor-v0", "CartPole-v0")
+TASKS = (*NETWORK_TASKS, *OTHER_TASKS)
+
+ATTACKED, IDEAL = "attacked", "attacked on an ideal channel"
+SCENARIOS = (ATTACKED, IDEAL)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row of the table: how its agents are trained, and what they act behind where they are judged.
+
+    Attributes:
+        arm: Arm of `ncs compare` by which agents are trained, or that needs no training.
+        tested: Arm behind whose filter they are judged; empty for the same.
+        attacked: Whether they are trained under the attack.
+        everywhere: Whether the row is that of all tasks, not only of those in which the network decides.
+        seeds: Runs of a block; None for as many as asked for.
+    """
+
+    arm: str
+    tested: str = ""
+    attacked: bool = False
+    everywhere: bool = False
+    seeds: int | None = None
+
+
+# Rows of the table by name. The first ones are primary: each has all runs of both blocks.
+PRIMARY = {
+    "unshielded": Entry("unshielded", everywhere=True),
+    "trusting:20": Entry("trusting:20"),
+    "shielded": Entry("shielded", everywhere=True),
+    "shield at test": Entry("unshielded", "shielded", everywhere=True),
+    "shield in training": Entry("shielded", "unshielded", everywhere=True),
+}
+SECONDARY = {
+    "penalized": Entry("penalized", seeds=5),
+    "lagrangian": Entry("lagrangian", seeds=5),
+    "lagrangian:0.02": Entry("lagrangian:0.02", seeds=5),
+    "lagrangian:0.1": Entry("lagrangian:0.1", seeds=5),
+    "unshielded, attacked": Entry("unshielded", attacked=True, seeds=5),
+}
+REGULATED = {
+    "lqr": Entry("lqr", everywhere=True),
+    "lqr:observer": Entry("lqr:observer", everywhere=True),
+    **{name: Entry(name) for name in ("mpc", "mpc:20", "mpc:40", "mpc:observer")},
+    **{f"lqr+{name}": Entry(f"lqr+{name}") for name in ("trusting:20", "trusting:40", "psf:20", "psf:40", "psf:tube")},
+    "lqr+shielded": Entry("lqr+shielded", everywhere=True),
+    "lqr:observer+shielded": Entry("lqr:observer+shielded", everywhere=True),
+    "mpc:observer+shielded": Entry("mpc:observer+shielded"),
+}
+# Policies that are the same in all runs need fewer.
+REGULATED = {name: replace(entry, seeds=4) for name, entry in REGULATED.items()}
+ENTRIES = PRIMARY | SECONDARY | REGULATED
+
+
+def rows_of(task: str) -> tuple[str, ...]:
+    """Returns the names of the rows of a task."""
+    return tuple(name for name, entry in ENTRIES.items() if entry.everywhere or task in NETWORK_TASKS)
+
+
+# Points at which training curves are kept.
+CURVE_POINTS = 16
+
+# Impairments of a channel; a rate is a sample every second step. Rows that are attacked with each of them.
+SWITCHES, SLOW = ("loss", "delay", "rate", "rounding"), 2
+SWITCHED = ("lqr", "lqr+trusting:20", "lqr+shielded", "unshielded", "trusting:20", "shielded")
+
+
+def measure(
+    tasks: Annotated[Sequence[str], some_of(TASKS)] = TASKS,
+    arms: Annotated[Sequence[str], some_of(tuple(ENTRIES))] = tuple(ENTRIES),
+    blocks: Sequence[int] = (0, 1),
+    seeds: int = 10,
+    steps: int = 100_000,
+    episodes: int = 50,
+    impairments: bool = True,
+    jobs: int = 2,
+    out: Path = Path("runs/suite"),
+    numbers: Path = NUMBERS,
+) -> None:
+    """Trains and judges arms on tasks, and keeps the numbers that the page shows.
+
+    A block is a seed of the whole experiment: of its --seeds trainings of an arm, and of the --episodes that each agent
+    is judged on per scenario. Finished runs in --out are kept: started again, the suite goes on. Tasks that --numbers
+    has and --tasks has not stay there.
+    """
+    known = json.loads(numbers.read_text("utf-8")) if numbers.exists() else {}
+    known = known if known.get("budget") == (budget := [list(blocks), seeds, steps, episodes]) else {}
+    found = {"budget": budget, "versions": versions()} | {key: known.get(key, {}) for key in ("tasks", "impairments")}
+    for task in tasks:
+        names = [name for name in rows_of(task) if name in arms]
+        of_task = {}
+        for block in blocks:
+            settings = _settings(task, block, seeds, steps, episodes, jobs, out)
+            chosen = [name for name in names if name in PRIMARY or block == blocks[0]]
+            switching = (
+                [arm for arm in SWITCHED if arm in names] if task in NETWORK_TASKS and block == blocks[0] else []
+            )
+            of_task[str(block)], switched_off = _block(settings, chosen, switching if impairments else [])
+            found["impairments"] |= {task: switched_off} if switched_off else {}
+        found["tasks"][task] = of_task
+        numbers.write_text(json.dumps(found, allow_nan=False) + "\n", "utf-8")
+    print(all_tables(found))
+
+
+def replicate(
+    tasks: Annotated[Sequence[str], some_of(TASKS)] = NETWORK_TASKS,
+    block: int = 2,
+    jobs: int = 2,
+    out: Path = Path("runs/suite"),
+    numbers: Path = NUMBERS,
+) -> None:
+    """Runs another block of the primary arms, and counts its numbers inside the printed intervals."""
+    found = json.loads(numbers.read_text("utf-8"))
+    _, seeds, steps, episodes = found["budget"]
+    inside, rows = [], [["outside", "printed", "block"]]
+    for task in tasks:
+        names = [name for name in PRIMARY if name in found["tasks"][task]["0"]]
+        again, _ = _block(_settings(task, block, seeds, steps, episodes, jobs, out), names)
+        for name in names:
+            for column, scenario in _JUDGED:
+                printed = _interval([each[name] for each in found["tasks"][task].values()], column, scenario)
+                new = float(np.mean(again[name]["scenarios"][scenario][column]))
+                inside.append(printed[0] - 1e-9 <= new <= printed[1] + 1e-9)
+                if not inside[-1]:
+                    rows.append([f"{task} {name}, {column}, {scenario}", _shown(printed), f"{new:.3f}"])
+    print(f"{sum(inside)} of {len(inside)} numbers of block {block} lie inside the printed intervals")
+    print(text_table(rows) if rows[1:] else "")
+
+
+def pages(root: Path = ROOT) -> None:
+    """Writes tables and figures of the stored numbers into the pages of a clone."""
+    file = root / NUMBERS
+    found = json.loads(file.read_text("utf-8"))
+    file.with_suffix(".txt").write_text(all_tables(found), "utf-8")
+    for name, png in suite_figures(found).items():
+        (file.parent / "images" / f"results-{name}.png").write_bytes(png)
+    page = root / PAGE
+    page.write_text(quoted(page.read_text("utf-8"), {name: table(found) for name, table in TABLES.items()}), "utf-8")
+
+
+def quoted(page: str, tables: Mapping[str, str]) -> str:
+    """Returns a page with the tables replaced that stand between `<!-- suite: NAME -->` and `<!-- end -->`.
+
+    Raises:
+        ValueError: If the page names none, or one that there is not.
+    """
+    mark = re.compile(r"(<!-- suite: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+    names = {name for _, name, _ in mark.findall(page)}
+    if not names or not names <= tables.keys():
+        raise ValueError(f"a page must quote tables between <!-- suite: NAME --> and <!-- end -->, got {sorted(names)}")
+    return mark.sub(lambda found: f"{found[1]}```\n{tables[found[2]]}\n```\n{found[3]}", page)
+
+
+def row_of(
+    task: str, policy: Callable[[LoopConfig, int], Policy], behind: str = "unshielded", block: int = 0
+) -> dict[str, Any]:
+    """Returns the numbers of a policy of one's own on the episodes of a block, as those of the table's rows.
+
+    Args:
+        task: One of `TASKS`.
+        policy: Makes what acts in a run, given the control loop and a seed.
+        behind: Arm of `ncs compare` that names a filter: "shielded", "trusting:20", or "unshielded" for none.
+        block: The block.
+    """
+    settings = _settings(task, block, 10, 1, 50, 1, Path())
+    loop = loop_config(settings.env)
+    certificate, results = certificate_of(loop, None, settings.safe_set), []
+    for index in range(settings.seeds):
+        own = run_of_arm(settings, loop, certificate, behind, index)
+        played = {
+            each: evaluate(under(each, own.loop), policy(own.loop, index), own.episodes, own.evaluation_seed).episodes
+            for each in (AS_TRAINED, *SCENARIOS)
+        }
+        result = RunResult(arm=behind, index=index, train_steps=0, train_violation_steps=0, train_interventions=0,
+                           history=[], episodes=played.pop(AS_TRAINED), scenarios=played)  # fmt: skip
+        results.append(result)
+    return _numbers(results)
+
+
+def _settings(task: str, block: int, seeds: int, steps: int, episodes: int, jobs: int, out: Path) -> CompareSettings:
+    return CompareSettings(
+        env=f"ncs_gym/{task}",
+        seed=block,
+        seeds=seeds,
+        steps=steps,
+        episodes=episodes,
+        scenarios=SCENARIOS,
+        tuned_arms=True,
+        jobs=jobs,
+        out=out / task / str(block),
+    )
+
+
+def _block(
+    settings: CompareSettings, names: Sequence[str], switching: Sequence[str] = ()
+) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
+    """Returns the numbers of rows in a block, and shares of violating episodes with impairments on and off.
+
+    First agents are trained, then they act behind other filters and on other channels.
+
+    Args:
+        settings: Of the block.
+        names: Of the rows.
+        switching: Arms that are attacked with no, each alone and all of `SWITCHES` on, each run in a tenth of its
+            episodes.
+    """
+    loop = loop_config(settings.env)
+    certificate = certificate_of(loop, None, settings.safe_set)
+
+    def runs_of(name: str, arm: str) -> list[TrainingRun]:
+        entry = ENTRIES[name]
+        runs = [run_of_arm(settings, loop, certificate, arm, index) for index in range(settings.seeds)][: entry.seeds]
+        if entry.attacked:
+            runs = [replace(each, training_loop=under(ATTACKED, each.training_loop)) for each in runs]
+        return [replace(each, grid_point="attacked" if entry.attacked else "") for each in runs]
+
+    first = {name: runs_of(name, ENTRIES[name].arm) for name in names if not ENTRIES[name].tested}
+    tested = {name: ENTRIES[name].arm for name in names if ENTRIES[name].tested}
+    first |= {arm: runs_of(arm, arm) for arm in tested.values() if arm not in first}
+    runs = sorted((each for own in first.values() for each in own), key=lambda each: each.index)
+    results = {each.name: result for each, result in zip(runs, results_of(runs, settings.out, settings), strict=True)}
+    numbers = {name: _numbers([results[each.name] for each in own]) for name, own in first.items()}
+
+    def with_agent(own: TrainingRun, trained: TrainingRun) -> TrainingRun:
+        folder = settings.out / "models" / trained.name
+        return replace(own, agent_files={each: (folder / each).read_bytes() for each in AGENT_FILES})
+
+    others = {
+        name: [
+            with_agent(replace(own, grid_point="tested"), trained)
+            for own, trained in zip(runs_of(name, ENTRIES[name].tested), first[arm], strict=True)
+        ]
+        for name, arm in tested.items()
+    }
+    env, few = registered_env(settings.env), replace(settings, episodes=-(-settings.episodes // 10))
+    for title, on in {"none": (), **{each: (each,) for each in SWITCHES}, "all": SWITCHES}.items() if switching else ():
+        changed = loop_config(settings.env, switched(env.channel, env.contract, on))
+        own_certificate = certificate_of(changed, None, settings.safe_set)
+        for arm in switching:
+            own = [run_of_arm(few, changed, own_certificate, arm, i, title) for i in range(len(first[arm]))]
+            pairs = zip(own, first[arm], strict=True)
+            others[f"{title}/{arm}"] = [with_agent(each, it) if it.trains else each for each, it in pairs]
+    second = results_of([each for own in others.values() for each in own], settings.out, settings) if others else []
+    found = {name: [second.pop(0) for _ in own] for name, own in others.items()}
+    for name, arm in tested.items():
+        numbers[name] = _numbers(found.pop(name)) | {key: numbers[arm][key] for key in ("training", "curve")}
+    shares: dict[str, dict[str, float]] = {arm: {} for arm in switching}
+    for key, played in found.items():
+        title, arm = key.split("/")
+        shares[arm][title] = float(np.mean(_numbers(played)["scenarios"][ATTACKED]["violating"]))
+    return {name: numbers[name] for name in names}, shares
+
+
+def _numbers(results: Sequence[RunResult]) -> dict[str, Any]:
+    """Returns the numbers of a row in a block: shares, means and counts of every run, and how trainings went."""
+    scenarios = {}
+    for name, played in episodes_table(results).groupby("scenario", sort=False):
+        by_run = played.groupby("run")
+        sums = by_run[["steps", "overridden", "proved_steps"]].sum()
+        scenarios[name] = {
+            "violating": by_run["violating"].mean().tolist(),
+            "return": by_run["return"].mean().tolist(),
+            "overridden": (sums["overridden"] / sums["steps"]).tolist(),
+            "proved": (sums["proved_steps"] / sums["steps"]).tolist(),
+            "episodes": len(played),
+        }
+    training = [each.train_violation_steps for each in results if each.train_steps]
+    return {"scenarios": scenarios, "training": training, "curve": _curve(results)}
+
+
+def _curve(results: Sequence[RunResult]) -> dict[str, list[list[float]]]:
+    """Returns training curves of every run at the same steps: mean return of recent episodes, and violating steps."""
+    points = training_table(results)
+    if points.empty:
+        return {}
+    runs = [own.dropna(subset="return") for _, own in points.groupby("run")]
+    if not all(map(len, runs)):
+        return {}  # no episode has ended
+    last = min(own["steps"].iloc[-1] for own in runs)
+    steps = np.linspace(last / CURVE_POINTS, last, CURVE_POINTS)
+    columns = {
+        each: [np.round(np.interp(steps, own["steps"], own[each]), 2).tolist() for own in runs]
+        for each in ("return", "violating_steps")
+    }
+    return {"steps": [steps.tolist()]} | columns
+
+
+def switched(channel: Channel, contract: ChannelContract | None, on: Sequence[str]) -> Assignments:
+    """Returns the changes of a channel by which some of `SWITCHES` are on and the others off.
+
+    With fewer samples as many losses in a row are allowed as the contract still has room for.
+    """
+    period = max(channel.send_period, SLOW) if "rate" in on else 1
+    delay = channel.delay if "delay" in on else 0
+    changes: Assignments = {"send_period": period, "delay": delay, "jitter": channel.jitter if "delay" in on else 0}
+    changes["quantization_step"] = channel.quantization_step if "rounding" in on else 0.0
+    if "loss" not in on:
+        changes["loss"] = 0.0
+    elif contract is not None:
+        room = (contract.max_age + 1 - delay - changes["jitter"]) // period - 1
+        most = channel.max_consecutive_losses
+        changes["max_consecutive_losses"] = room if most is None else min(room, most)
+    return changes
+
+
+# Columns that a block is judged by, in their scenarios.
+_JUDGED = (("return", AS_TRAINED), ("violating", AS_TRAINED), ("violating", ATTACKED))
+
+
+def _interval(blocks: Sequence[dict[str, Any]], column: str, scenario: str) -> tuple[float, float]:
+    """Returns where the mean of another block lies with 95 %: Student's prediction over runs.
+
+    Of shares it stays within 0 and 1, and where all are 0 or all 1 it is the exact interval of a proportion.
+    """
+    values = np.concatenate([each["scenarios"][scenario][column] for each in blocks])
+    mean, count, one = float(np.mean(values)), len(values), len(values) / len(blocks)
+    if column != "return" and mean in (0.0, 1.0):
+        trials = sum(each["scenarios"][scenario]["episodes"] for each in blocks)
+        low, high = clopper_pearson(round(mean * trials), trials)
+        return low, high
+    half = float(t.ppf(0.5 + CONFIDENCE / 2.0, count - 1) * np.std(values, ddof=1) * sqrt(1.0 / count + 1.0 / one))
+    if column == "return":
+        return mean - half, mean + half
+    return max(mean - half, 0.0), min(mean + half, 1.0)
+
+
+def _of(row: dict[str, Any], column: str, scenario: str) -> np.ndarray:
+    return np.array(row["scenarios"][scenario][column])
+
+
+def _mean(blocks: Iterable[dict[str, Any]], column: str, scenario: str) -> float:
+    return float(np.mean(np.concatenate([each["scenarios"][scenario][column] for each in blocks])))
+
+
+def _shown(interval: Sequence[float], scale: float = 1.0, digits: int = 1) -> str:
+    return f"[{scale * interval[0]:z.{digits}f}, {scale * interval[1]:z.{digits}f}]"
+
+
+def task_table(blocks: Mapping[str, dict[str, Any]]) -> str:
+    """Returns the rows of a task: both blocks of returns and shares, the interval of another block, and the rest."""
+    rows = [
+        ["", "return", "", "violating [%]", "", "", "while", "over-", "proof"],
+        ["", "by block", "+-", "trained", "attacked", "interval", "training", "ridden", "held"],
+    ]
+    for name in ENTRIES:
+        own = [each[name] for each in blocks.values() if name in each]
+        if not own:
+            continue
+
+        def cells(column: str, scenario: str, scale: float, digits: int, own: Any = own) -> str:
+            return " ".join(f"{scale * _mean([each], column, scenario):z.{digits}f}" for each in own)
+
+        low, high = _interval(own, "return", AS_TRAINED)
+        training = [count for each in own for count in each["training"]]
+        overridden, proved = _mean(own, "overridden", AS_TRAINED), _mean(own, "proved", ATTACKED)
+        acts = not name.startswith("unshielded") and overridden > 0.0
+        rows.append(
+            [
+                name,
+                cells("return", AS_TRAINED, 1.0, 1),
+                f"{0.5 * (high - low):.1f}",
+                cells("violating", AS_TRAINED, 100.0, 0),
+                cells("violating", ATTACKED, 100.0, 0),
+                _shown(_interval(own, "violating", ATTACKED), 100.0, 0),
+                f"{np.mean(training):,.0f}" if training else "-",
+                f"{100 * overridden:.1f}" if acts else "-",
+                f"{100 * proved:.0f}" if proved else "-",
+            ]
+        )
+    return text_table(rows, rules=(2,))
+
+
+def differences_table(found: dict[str, Any]) -> str:
+    """Returns the sentences about who is better, as numbers of both blocks: see the page."""
+    pairs = (
+        ("violating", ATTACKED, 100.0, "unshielded", "shielded"),
+        ("violating", ATTACKED, 100.0, "trusting:20", "shielded"),
+        ("return", AS_TRAINED, 1.0, "shielded", "shield at test"),
+        ("return", AS_TRAINED, 1.0, "lqr:observer+shielded", "shielded"),
+    )
+    rows = [["", "", "first less second", ""], ["", "of", "by block", "interval"]]
+    for column, scenario, scale, first, second in pairs:
+        rows.append([f"{first} - {second}"])
+        for task, blocks in found["tasks"].items():
+            both = [each for each in blocks.values() if first in each and second in each]
+            if not both:
+                continue
+            values = [
+                scale * (_of(each[first], column, scenario) - _of(each[second], column, scenario)) for each in both
+            ]
+            every = np.concatenate(values)
+            mean, half = float(np.mean(every)), float(t.ppf(0.975, len(every) - 1) * sem(every))
+            means = " ".join(f"{np.mean(each):+z.1f}" for each in values)
+            title = f"{column}, {scenario}" + (" [points]" if scale > 1.0 else "")
+            rows.append([f"  {task}", title, means, _shown((mean - half, mean + half))])
+    return text_table(rows, rules=(2,))
+
+
+def impairments_table(found: dict[str, Any]) -> str:
+    """Returns violating episodes under attack [%] with no impairment of the channel, each alone, and all."""
+    table = [["attacked, violating [%]", "none", *SWITCHES, "all"]]
+    for task, rows in found["impairments"].items():
+        table += [[f"{task} {arm}", *(f"{100 * share:.0f}" for share in row.values())] for arm, row in rows.items()]
+    return text_table(table)
+
+
+def budget_text(found: dict[str, Any]) -> str:
+    """Returns what was spent."""
+    blocks, seeds, steps, episodes = found["budget"]
+    return (
+        f"{len(blocks)} blocks of {seeds} runs per primary arm, {steps:,} training steps each,\n"
+        f"{episodes} episodes per run and scenario"
+    )
+
+
+def network_table(found: dict[str, Any]) -> str:
+    """Returns what the network does to a filter that trusts its estimate, beside the shield."""
+    rows = [
+        ["violating", "as", "attacked,", "attacked,", "of another"],
+        ["[%]", "trained", "ideal", "network", "block"],
+    ]
+    for task in (each for each in NETWORK_TASKS if each in found["tasks"]):
+        for name in ("unshielded", "trusting:20", "shielded"):
+            own = [each[name] for each in found["tasks"][task].values() if name in each]
+            if own:
+                shares = [f"{100 * _mean(own, 'violating', each):.1f}" for each in (AS_TRAINED, IDEAL, ATTACKED)]
+                rows.append([f"{task} {name}", *shares, _shown(_interval(own, "violating", ATTACKED), 100.0)])
+    return text_table(rows, rules=(2,))
+
+
+def tasks_table(_: dict[str, Any]) -> str:
+    """Returns what the tasks are, from their environments."""
+    rows = [
+        ["task", "states,", "network: lost,", "contract", "disturbance", "reward"],
+        ["", "inputs", "delay, every", "[age]", "", ""],
+    ]
+    for task in TASKS:
+        env = registered_env(f"ncs_gym/{task}")
+        channel, plant = env.channel, env.plant
+        late = f"{channel.delay}-{channel.delay + channel.jitter}" if channel.jitter else f"{channel.delay}"
+        rows.append(
+            [
+                task,
+                f"{plant.n}, {plant.m}",
+                f"{channel.loss:.0%}, {late}, {channel.send_period}",
+                "-" if env.contract is None else f"{env.contract.max_age}",
+                type(env.disturbance).__name__.removesuffix("Disturbance").lower(),
+                type(env.task).__name__.removesuffix("Tracking").lower(),
+            ]
+        )
+    return text_table(rows, rules=(2,))
+
+
+TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
+    "budget": budget_text,
+    "tasks": tasks_table,
+    "network": network_table,
+    "differences": differences_table,
+    "impairments": impairments_table,
+    **{task: lambda found, task=task: task_table(found["tasks"][task]) for task in TASKS},
+}
+
+
+def all_tables(found: dict[str, Any]) -> str:
+    """Returns all tables as plain text."""
+    shown = [name for name in TABLES if name not in TASKS or name in found["tasks"]]
+    return "\n\n\n".join(f"{name}\n{TABLES[name](found)}" for name in shown) + "\n"
+
+
+COMMANDS = (measure, replicate, pages)
+
+if __name__ == "__main__":
+    run(__doc__, COMMANDS)

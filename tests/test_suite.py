@@ -1,0 +1,163 @@
+"""The benchmark: rows, blocks, intervals for another block, tables of exact numbers, impairments on and off."""
+
+import json
+import re
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from benchmarks import suite
+from benchmarks.suite import (
+    ATTACKED,
+    ENTRIES,
+    IDEAL,
+    NETWORK_TASKS,
+    PRIMARY,
+    SWITCHES,
+    TASKS,
+    all_tables,
+    rows_of,
+    switched,
+    task_table,
+)
+from benchmarks.suite_figures import suite_figures
+from experiments.analysis.statistics import clopper_pearson
+from experiments.runs.loops import AS_TRAINED, changed_channel
+from ncs_gym.envs.env import ncs_env
+from tests.workers import no_worker_processes
+
+RUNS = 3
+
+
+def row(mean=150.0, own=0.0, attacked=0.0, trains=True):
+    """The numbers of a row in a block, of runs that differ by 1 in return."""
+    shares = {AS_TRAINED: own, ATTACKED: attacked, IDEAL: 0.0}
+    scenarios = {
+        name: {
+            "violating": [share] * RUNS,
+            "return": [mean - 1.0, mean, mean + 1.0],
+            "overridden": [0.1] * RUNS,
+            "proved": [0.0 if attacked else 1.0] * RUNS,
+            "episodes": 50 * RUNS,
+        }
+        for name, share in shares.items()
+    }
+    curve = {"steps": [[1e4, 2e4]], "return": [[1.0, 2.0]] * RUNS, "violating_steps": [[3.0, 4.0]] * RUNS}
+    return {"scenarios": scenarios, "training": [7] * RUNS if trains else [], "curve": curve if trains else {}}
+
+
+@pytest.fixture
+def found():
+    """Numbers of two tasks with every row, of which the second block is better by 2 in return."""
+    tasks = {}
+    for task in ("Convoy-v0", "BatchReactor-v0"):
+        tasks[task] = {
+            str(block): {
+                name: row(150.0 + 2.0 * block, 0.0, 0.5 * (name == "unshielded"), name not in suite.REGULATED)
+                for name in rows_of(task)
+                if name in PRIMARY or not block
+            }
+            for block in (0, 1)
+        }
+    switches = {"lqr": dict(zip(("none", *SWITCHES, "all"), np.linspace(0.0, 1.0, 6).tolist(), strict=True))}
+    return {"budget": [[0, 1], RUNS, 1000, 50], "tasks": tasks, "impairments": {"Convoy-v0": switches}}
+
+
+def cells(table, name):
+    line = next(line for line in table.splitlines() if line.startswith(f"{name} "))
+    return re.split(r"\s{2,}", line)
+
+
+def test_row_shows_both_blocks_and_where_another_one_would_lie(found):
+    shown = cells(task_table(found["tasks"]["Convoy-v0"]), "unshielded")
+    assert shown[1] == "150.0 152.0 2.6"
+    runs = [149.0, 150.0, 151.0, 151.0, 152.0, 153.0]
+    half = 2.5706 * np.std(runs, ddof=1) * np.sqrt(1.0 / 6.0 + 1.0 / 3.0)  # 2.5706: Student, five degrees of freedom
+    blocks = [each["unshielded"] for each in found["tasks"]["Convoy-v0"].values()]
+    low, high = suite._interval(blocks, "return", AS_TRAINED)
+    assert (low, high) == pytest.approx((151.0 - half, 151.0 + half), abs=1e-3)
+
+
+def test_shares_of_nothing_have_the_exact_interval(found):
+    blocks = [each["shielded"] for each in found["tasks"]["Convoy-v0"].values()]
+    assert suite._interval(blocks, "violating", ATTACKED) == tuple(clopper_pearson(0, 100 * RUNS))
+
+
+def test_interval_covers_the_mean_of_another_block_as_often_as_it_says():
+    rng, inside = np.random.default_rng(0), 0
+    for _ in range(400):
+        blocks = [{"scenarios": {AS_TRAINED: {"return": rng.normal(size=10).tolist()}}} for _ in range(2)]
+        low, high = suite._interval(blocks, "return", AS_TRAINED)
+        inside += low <= rng.normal(size=10).mean() <= high
+    assert 0.92 <= inside / 400 <= 0.98
+
+
+def test_tables_have_every_row_and_no_negative_zero(found):
+    found["tasks"]["Convoy-v0"]["0"]["shielded"] = row(-1e-9)
+    text = all_tables(found)
+    assert all(f"\n{name} " in text for name in ENTRIES)
+    assert not re.search(r"(?<![\d.])-0(\.0+)?(?![\d.])", text)
+    assert max(map(len, text.splitlines())) <= 95
+    assert all_tables(json.loads(json.dumps(found))) == text
+
+
+def test_differences_are_taken_run_by_run(found):
+    lines = suite.differences_table(found).splitlines()
+    first = lines[lines.index("unshielded - shielded") + 1]
+    assert re.split(r"\s{2,}", first.strip())[:2] == ["Convoy-v0", "violating, attacked [points]"]
+    assert "+50.0 +50.0" in first
+
+
+def test_figures_are_drawn_from_the_numbers(found):
+    figures = suite_figures(found)
+    assert figures.keys() == {"violations", "return", "training"}
+    assert all(png.startswith(b"\x89PNG") for png in figures.values())
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_impairment_keeps_the_contract_and_has_what_is_on(task):
+    env = ncs_env(gym.make(f"ncs_gym/{task}"))
+    for on in ((), *((each,) for each in SWITCHES), SWITCHES):
+        channel = changed_channel(env.channel, switched(env.channel, env.contract, on)) or env.channel
+        assert env.contract is None or env.contract.is_kept_by(channel)
+        assert (
+            channel.loss > 0.0,
+            channel.delay > 0,
+            channel.send_period > 1,
+            channel.quantization_step > 0.0,
+        ) == tuple(name in on for name in SWITCHES)
+
+
+@pytest.mark.slow
+def test_a_small_suite_shows_that_losses_decide_and_nothing_breaks_the_shield(tmp_path):
+    def made(**changed):
+        names = ("unshielded", "shielded", "shield at test", "unshielded, attacked", "lqr", "lqr:observer+shielded")
+        settings = {"tasks": NETWORK_TASKS[:1], "arms": names, "seeds": 2, "steps": 1500, "episodes": 40}
+        suite.measure(**settings | changed, jobs=1, out=tmp_path / "out", numbers=tmp_path / "results.json")
+        return json.loads((tmp_path / "results.json").read_text())
+
+    with no_worker_processes():
+        found = made()
+        assert made() == found  # finished runs are kept
+    first, second = found["tasks"]["CSTR-v0"].values()
+    assert set(second) == {"unshielded", "shielded", "shield at test"}
+    assert first["unshielded"]["curve"] == first["shield at test"]["curve"]  # the same agents
+    assert first["unshielded"]["training"] != first["unshielded, attacked"]["training"]
+    for block in (first, second):
+        for name in set(block) & {"shielded", "shield at test", "lqr:observer+shielded"}:
+            assert not any(any(each["violating"]) for each in block[name]["scenarios"].values())
+    shares = found["impairments"]["CSTR-v0"]
+    assert (shares["lqr"]["none"], set(shares["shielded"].values())) == (0.0, {0.0})
+    assert shares["lqr"]["loss"] >= 0.25
+    assert all(len(each) == 2 for each in (first["unshielded"]["training"], second["unshielded"]["training"]))
+
+
+def test_policy_of_ones_own_has_a_row_on_the_same_episodes(monkeypatch):
+    monkeypatch.setattr(suite, "SCENARIOS", (ATTACKED,))
+    own = suite.row_of(
+        "CSTR-v0", lambda loop, seed: lambda observations, infos: np.zeros((len(observations), 1)), "shielded"
+    )
+    assert len(own["scenarios"][AS_TRAINED]["return"]) == 10
+    assert not any(own["scenarios"][ATTACKED]["violating"])
+    assert own["training"] == []
