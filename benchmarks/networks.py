@@ -242,7 +242,7 @@ def _lost_command() -> CaptionedFigure:
 
 RECORDED = ("CartPole", "BatchReactor", "Convoy", "LaneKeeping")
 SPAN, PERIOD, EPISODE = 3600.0, 0.02, 60.0
-# Stalls an hour of at least so long [s], as counted on public rural drives, and what a packet takes when a queue drains.
+# Stalls an hour of at least so long [s], as counted on public rural drives; a packet's time when a queue drains [s].
 STALLS, STALL, SERVICE = 228, 0.8, 0.002
 
 
@@ -384,9 +384,9 @@ def recorded(
     """Loops over networks as records have them: how often the box is left behind filters, and what is claimed then.
 
     The records are made here, with a seed, in the shapes of real ones: "Wi-Fi" stalls in clusters, for lengths with a
-    heavy tail; on a "rural" drive nothing is lost, and what waits out 228 stalls an hour drains in order; an interferer's
-    "burst" takes nine of ten packets for .3 s every ten seconds. All are replayed by their clock, and all break the
-    contracts.
+    heavy tail; on a "rural" drive nothing is lost, and what waits in 228 stalls an hour drains in order; a "burst" of
+    an interferer takes nine of ten packets for .3 s every ten seconds. All are replayed by their clock, and all break
+    the contracts.
 
     The agent pushes in one direction for half a second to two, then in another; "mpc" and "mpc:20" are model predictive
     control of the task instead, without a margin and with one of a fifth. Disturbances are adversarial. An episode ends

@@ -111,8 +111,8 @@ def measure(
     arms: Annotated[Sequence[str], some_of(tuple(ENTRIES))] = tuple(ENTRIES),
     blocks: Sequence[int] = (0, 1),
     seeds: int = 10,
-    steps: int = 100_000,
-    episodes: int = 50,
+    steps: int = 60_000,
+    episodes: int = 25,
     impairments: bool = True,
     jobs: int = 2,
     out: Path = Path("runs/suite"),
@@ -203,7 +203,7 @@ def row_of(
         behind: Arm of `ncs compare` that names a filter: "shielded", "trusting:20", or "unshielded" for none.
         block: The block.
     """
-    settings = _settings(task, block, 10, 1, 50, 1, Path())
+    settings = _settings(task, block, 10, 1, 25, 1, Path())
     loop = loop_config(settings.env)
     certificate, results = certificate_of(loop, None, settings.safe_set), []
     for index in range(settings.seeds):
