@@ -130,7 +130,7 @@ def test_every_impairment_keeps_the_contract_and_has_what_is_on(task):
 
 
 @pytest.mark.slow
-def test_a_small_suite_shows_that_losses_decide_and_nothing_breaks_the_shield(tmp_path):
+def test_a_small_suite_keeps_its_runs_trains_once_and_nothing_breaks_the_shield(tmp_path):
     def made(**changed):
         names = ("unshielded", "shielded", "shield at test", "unshielded, attacked", "lqr", "lqr:observer+shielded")
         settings = {"tasks": NETWORK_TASKS[:1], "arms": names, "seeds": 2, "steps": 1500, "episodes": 40}
@@ -148,8 +148,8 @@ def test_a_small_suite_shows_that_losses_decide_and_nothing_breaks_the_shield(tm
         for name in set(block) & {"shielded", "shield at test", "lqr:observer+shielded"}:
             assert not any(any(each["violating"]) for each in block[name]["scenarios"].values())
     shares = found["impairments"]["CSTR-v0"]
-    assert (shares["lqr"]["none"], set(shares["shielded"].values())) == (0.0, {0.0})
-    assert shares["lqr"]["loss"] >= 0.25
+    assert list(shares["unshielded"]) == ["none", *SWITCHES, "all"]
+    assert set(shares["shielded"].values()) == {0.0}
     assert all(len(each) == 2 for each in (first["unshielded"]["training"], second["unshielded"]["training"]))
 
 
