@@ -30,11 +30,11 @@ class LimitValues(ReadOnlyArrays):
         box: Rows c_j of the safe box, shape (k, n), in units of half the range that is allowed; where one end is open,
             the other one is 1 unit away.
         box_ends: The low and the high ends of c_j x, shape (2, k); -1 and 1 where limits are symmetric, infinite where
-            there is none. Also as box_low and box_high.
+            there is none.
         is_past_row: Which rows limit past inputs, which nothing ever takes there, shape (k,).
         mixed_rows: Rows of limits on (x, u) at the beginning of a step, shape (q, n + m), in units as those of `box`.
         mixed_ends: Their low and high ends, shape (2, q).
-        input_ends: The low and the high ends of the inputs, shape (2, m); also as input_low and input_high.
+        input_ends: The low and the high ends of the inputs, shape (2, m).
         input_middle: The input that action 0 stands for, shape (m,): the middle of the limits.
         input_half: Half the range of each input, shape (m,): input_middle +- input_half is within the limits, as floats
             add.
@@ -60,14 +60,10 @@ class LimitValues(ReadOnlyArrays):
     past: int
     box: np.ndarray
     box_ends: np.ndarray
-    box_low: np.ndarray
-    box_high: np.ndarray
     is_past_row: np.ndarray
     mixed_rows: np.ndarray
     mixed_ends: np.ndarray
     input_ends: np.ndarray
-    input_low: np.ndarray
-    input_high: np.ndarray
     input_middle: np.ndarray
     input_half: np.ndarray
     input_scales: tuple[tuple[float, float], ...]
@@ -90,10 +86,10 @@ class LimitValues(ReadOnlyArrays):
         number = np.arange(len(whole.box.rows)) - len(rest.box.rows)
         self._set(A=whole.A, B=whole.B, H=whole.H, dt=self.model.dt, past=whole.past)
         self._set(n=len(whole.A), m=len(half), p=len(whole.H))
-        self._set(box=whole.box.rows, box_low=whole.box.low, box_high=whole.box.high, box_ends=np.stack(whole.box[1:]))
+        self._set(box=whole.box.rows, box_ends=np.stack(whole.box[1:]))
         self._set(is_past_row=(number >= 0) & (number < whole.past))
         self._set(mixed_rows=whole.mixed.rows, mixed_ends=np.stack(whole.mixed[1:]))
-        self._set(input_ends=whole.inputs, input_low=low, input_high=high, input_middle=middle, input_half=half)
+        self._set(input_ends=whole.inputs, input_middle=middle, input_half=half)
         self._set(input_scales=tuple(zip(middle.tolist(), half.tolist(), strict=True)))
         self._set(largest_input=np.maximum(-low, high), step_offset=whole.step_offset)
         self._set(operating_state=whole.state, operating_input=whole.input)

@@ -181,18 +181,18 @@ class LinearPlant(BetweenSamples):
     @cached_property
     def is_symmetric(self) -> bool:
         """Whether the limits are |c_j x| <= 1 and |u_i| <= u_max_i, and no others."""
-        ends = bool((np.abs(self.box_ends) == 1.0).all() and np.array_equal(-self.input_low, self.input_high))
-        return ends and not len(self.mixed_rows)
+        ends = np.abs(self.box_ends) == 1.0, np.array_equal(-self.input_ends[0], self.input_ends[1])
+        return all(map(np.all, ends)) and not len(self.mixed_rows)
 
     @property
     def box_rows(self) -> np.ndarray:
         """Rows c_j of a symmetric safe box |c_j x| <= 1, shape (k, n); raises ValueError if limits are others."""
-        return self._if_symmetric(self.box, "box, box_low and box_high")
+        return self._if_symmetric(self.box, "box and box_ends")
 
     @property
     def u_max(self) -> np.ndarray:
         """Symmetric limits |u_i| <= u_max_i, shape (m,); raises ValueError if limits are others."""
-        return self._if_symmetric(self.input_high, "input_low and input_high")
+        return self._if_symmetric(self.input_ends[1], "input_ends")
 
     def _if_symmetric(self, value: np.ndarray, instead: str) -> np.ndarray:
         if not self.is_symmetric:

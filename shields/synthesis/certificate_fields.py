@@ -140,7 +140,7 @@ def volume_of(plant: LinearPlant, L: np.ndarray) -> float:
 
     It is where the box has a center, a point in the middle between all of its pairs of ends.
     """
-    middle, half = 0.5 * (plant.box_low + plant.box_high), 0.5 * (plant.box_high - plant.box_low)
+    middle, half = 0.5 * plant.box_ends.sum(axis=0), 0.5 * np.ptp(plant.box_ends, axis=0)
     if not np.isfinite(half).all() or exact.rank(plant.box) < plant.n:
         return math.nan
     widths = plant.half_widths
