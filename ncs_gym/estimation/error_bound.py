@@ -11,7 +11,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age, in_round_numbers
-from ncs_gym.estimation.error_sets import ErrorSet, ErrorSetError, InvariantErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet, ErrorSetError
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.description import outputs_of
 from ncs_gym.plants.linear_plant import LinearPlant
@@ -184,9 +184,9 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     best: Any = minimize_scalar(size, bounds=bounds, method="bounded", options=options)
     rate = 1.0 - float(exact.rounded(1.0 - best.x, RATE_DIGITS))
     Sigma = T @ (GROWTH * _smallest_solution(A, D, first, rate)) @ T.T
-    found = InvariantErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=rate)
+    found = ErrorSet(shapes=0.5 * (Sigma + Sigma.T)[None], rates=np.array([rate]))
     require_error_set(found, plant)
-    return _round_if_it_holds(replace(found, Sigma=rounded_up(found.Sigma, DIGITS)), found, plant)
+    return _round_if_it_holds(replace(found, shapes=rounded_up(found.Sigma, DIGITS)[None]), found, plant)
 
 
 def _smallest_solution(A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> np.ndarray:

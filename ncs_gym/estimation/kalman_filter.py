@@ -94,12 +94,12 @@ class ErrorRecursion:
         self.Q, self.R = plant.kalman_covariances[0], _sensor_covariance(plant, quantization_step)
         if first is None:
             shape = plant.initial_error.shape_matrix
-            first = ErrorStatistics(plant.kalman_covariances[2], shape, 0, is_inside(shape, error_set.shape_at(0)))
+            first = ErrorStatistics(plant.kalman_covariances[2], shape, 0, is_inside(shape, error_set.shapes[0]))
         self.first = first
         # Next to that of others, the deviation of a state that nothing disturbs would become smaller for ever, and all
         # would where nothing disturbs any: covariances would not recur. Deviations are no smaller than this share of
         # the largest one, each in units of what the certified set allows.
-        self._share, self._units = 2.0 ** -(covariance_bits + 4), np.sqrt(np.diag(error_set.shape_at(0)))
+        self._share, self._units = 2.0 ** -(covariance_bits + 4), np.sqrt(np.diag(error_set.shapes[0]))
 
     def coarser(self) -> ErrorRecursion:
         """Returns a recursion that rounds shapes up more coarsely, so that fewer differ; itself if it is coarse."""
@@ -131,7 +131,7 @@ class ErrorRecursion:
         """
         covariance, shape, age, _ = statistics
         certified = self.error_set
-        newest = certified.shape_at(0)
+        newest = certified.shapes[0]
         kalman = self._kalman_update(covariance)
         covariance = covariance if kalman is None else kalman[1]
         gains = [self.sets.gain(shape)] if kalman is None else [kalman[0], self.sets.gain(shape)]

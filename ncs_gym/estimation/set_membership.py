@@ -44,7 +44,7 @@ class SetMembership:
 
         self.plant, self.error_set, self.shape_step = plant, error_set, shape_step
         Sigma = error_set.Sigma
-        self._ball = np.linalg.cholesky(error_set.shape_at(0))
+        self._ball = np.linalg.cholesky(error_set.shapes[0])
         self._to_ball = solve_triangular(self._ball, np.eye(plant.n), lower=True)
         self._abs_ball, self._abs_to_ball = np.abs(self._ball), np.abs(self._to_ball)
         # Entries of |ball to_ball - I| are at most these.

@@ -12,7 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.model import zero_order_hold
+from ncs_gym.bounds import Bounds
+from ncs_gym.limits import Limits
+from ncs_gym.model import Model, zero_order_hold
 from ncs_gym.plants.hard_bounds import HardBounds
 from ncs_gym.validation import read_only, setting, shown
 
@@ -43,10 +45,21 @@ class BetweenSamples(HardBounds):
     """What the limits say of times between samples.
 
     Attributes:
+        model, limits, bounds: What all follows from.
+        dt: Duration of a step [s].
+        state_names, state_units, input_names, input_units: The labels, with defaults.
         continuous_model: [Ac, Bc] that A and B were sampled from, shape (n, n + m); None if unknown.
         between_samples: Number of times per step at which the box counts; None for the sampling instants alone.
     """
 
+    model: Model
+    limits: Limits
+    bounds: Bounds
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    dt = setting("dt", "model.dt")
     continuous_model = setting("continuous_model", "model.continuous")
     between_samples = setting("between_samples", "limits.between_samples")
 

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from ncs_gym.bounds import DELTA, Bounds, Sum
-from ncs_gym.limits import Deviations, Limits
+from ncs_gym.limits import Limits, LimitValues
 from ncs_gym.model import Model, as_point
 from ncs_gym.plants.between_samples import BetweenSamples
 from ncs_gym.plants.description import assumptions_of, described
 from ncs_gym.plants.hard_bounds import Source, weight_of
+from ncs_gym.plants.past_inputs import with_past_inputs
 from ncs_gym.plants.resting_point import at_rest, with_residual
 from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, read_back
@@ -73,9 +74,11 @@ class LinearPlant(BetweenSamples):
         sums = self.bounds.sums(n, len(model.H))
         declared = sums[0].declared
         rest = at_rest(self.limits.around(model), declared.sized(n))
-        region = model.A, model.B, model.dt, *rest.box, rest.inputs, *rest.mixed
+        region = model.A, model.B, model.dt, rest.box, *rest.box_ends, rest.input_ends
+        region += rest.mixed_rows, *rest.mixed_ends
         self._set(bounds=Bounds(*sums), remainder=None, region=_digest(enumerate(region)))
-        self._take(rest)
+        whole = with_past_inputs(rest, model.delays, self.limits.change_within(rest.input_half))
+        self._set(**whole.values, n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
         self._declare([declared, *sums[1:]], rest)
         self._name()
         self._check_between_samples()
@@ -83,9 +86,9 @@ class LinearPlant(BetweenSamples):
             disturbance = Sum((*declared.parts, *owned))
             self._set(remainder=owned[0], bounds=replace(self.bounds, disturbance=disturbance))
 
-    def _declare(self, sums: list[Sum], rest: Deviations) -> None:
+    def _declare(self, sums: list[Sum], rest: LimitValues) -> None:
         """Keeps what is declared of the three uncertainties."""
-        n, rows = len(rest.A), rest.box.rows
+        n, rows = len(rest.A), rest.box
         weight, past = weight_of(rows, np.zeros(n)), self.past
         disturbance = Source.of(sums[0], weight, past, keeps_ball=True)
         if rest.lacking.any():
@@ -94,7 +97,6 @@ class LinearPlant(BetweenSamples):
             disturbance = disturbance._replace(bound=Ellipsoid(np.pad(held, (0, past))))
         sensor, first = Source.of(sums[1], np.eye(self.p)), Source.of(sums[2], weight, past)
         self._set(of_disturbance=disturbance, of_sensor=sensor, of_first_error=first)
-        self._set(process_noise=disturbance.noise, sensor_noise=sensor.noise, initial_noise=first.noise)
         self._set(delta=next((each.gaussian.delta for each in sums if each.gaussian), DELTA))
 
     def _name(self) -> None:
@@ -177,30 +179,6 @@ class LinearPlant(BetweenSamples):
         if self.remainder is None:
             return self
         return replace(self, bounds=replace(self.bounds, disturbance=self.bounds.disturbance.declared))
-
-    @cached_property
-    def is_symmetric(self) -> bool:
-        """Whether the limits are |c_j x| <= 1 and |u_i| <= u_max_i, and no others."""
-        ends = np.abs(self.box_ends) == 1.0, np.array_equal(-self.input_ends[0], self.input_ends[1])
-        return all(map(np.all, ends)) and not len(self.mixed_rows)
-
-    @property
-    def box_rows(self) -> np.ndarray:
-        """Rows c_j of a symmetric safe box |c_j x| <= 1, shape (k, n); raises ValueError if limits are others."""
-        return self._if_symmetric(self.box, "box and box_ends")
-
-    @property
-    def u_max(self) -> np.ndarray:
-        """Symmetric limits |u_i| <= u_max_i, shape (m,); raises ValueError if limits are others."""
-        return self._if_symmetric(self.input_ends[1], "input_ends")
-
-    def _if_symmetric(self, value: np.ndarray, instead: str) -> np.ndarray:
-        if not self.is_symmetric:
-            raise ValueError(
-                "the limits of this plant are not |c_j x| <= 1 and |u_i| <= u_max_i alone, and only these are taken by "
-                f"what was asked for (a plant has {instead}, mixed_rows and mixed_ends)"
-            )
-        return value
 
     @property
     def members(self) -> Any:

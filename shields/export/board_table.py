@@ -12,7 +12,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from ncs_gym.estimation.error_bound import require_error_set
-from ncs_gym.estimation.error_sets import ErrorSetsByAge
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
 from ncs_gym.validation import ReadOnlyArrays
 from shields.certificate import Certificate, CertificateError, Updates
@@ -83,7 +83,7 @@ class BoardTable(ReadOnlyArrays):
         ready = SafetyFilter(certificate, plant, "switch")
         test, reach, shapes = ready.test, SIMULATED_REACH * plant.half_widths, [*certificate.error_shapes, updates.last]
         require_error_set(
-            ErrorSetsByAge(
+            ErrorSet(
                 contract=updates.contract,
                 shapes=np.array(shapes),
                 rates=np.array([proof.rate for proof in certificate.proofs]),

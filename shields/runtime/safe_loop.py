@@ -498,7 +498,8 @@ class SafeLoop(CopiedWhole):
 
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""
-        return self._estimator.predicted(self._inputs.pending[: self._input_delay])
+        estimate, number = self._estimator.numbered(self._inputs.pending[: self._input_delay])
+        return estimate, self._estimator.table.shape(number)
 
 
 def _as_input(given: Any, shape: tuple[int, ...]) -> np.ndarray | None:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Ellipsoid, ErrorSet, LinearPlant, exact
-from ncs_gym.estimation.error_sets import ErrorSetsByAge
 from ncs_gym.plants.hard_bounds import inflated
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import reach_in
@@ -58,7 +57,7 @@ def proofs_of(
 
 def _updates(errors: ErrorSet) -> Updates | None:
     """Returns what a channel contract adds to the proofs; None without one."""
-    if not isinstance(errors, ErrorSetsByAge):
+    if errors.contract is None:
         return None
     return Updates(
         contract=errors.contract,
