@@ -106,9 +106,8 @@ def test_state_without_a_limit_has_the_size_that_its_own_units_and_inputs_give_i
 )
 def test_nothing_rests_at_an_end_of_its_limits(limits):
     model = {"A": [[0.9]], "B": [[0.1]], "dt": 1.0, "sensor_bound": 0.0, "initial_bound": 0.0, "disturbance_bound": 0.0}
-    with pytest.raises(ValueError, match=r"at=\(state, input\) of the Model, strictly between") as refused:
+    with pytest.raises(ValueError, match=r"at=\(state, input\) of the Model, strictly between"):
         linear_plant(**model | ({} if "state_limits" in limits else {"box": 1.0}) | limits)
-    assert ("give at" in str(refused.value)) == ("give at" in message)
 
 
 def test_disturbance_may_act_in_some_directions_alone():
