@@ -141,8 +141,7 @@ class Estimator(PastSteps):
             inputs: What was applied since then, (m,) each, the newest first.
         """
         first = ErrorStatistics(self.plant.kalman_covariances[2], self.error_set.shapes[0], 0, True)
-        coarsens = self._usual.coarsens
-        self.histories = histories_of(self.plant, self.channel, self.error_set, coarsens, first=first)
+        self.histories = histories_of(self.plant, self.channel, self.error_set, first=first)
         self._begin(mean, self.step - len(inputs))
         for u in reversed(inputs):
             self.advance(u, ())

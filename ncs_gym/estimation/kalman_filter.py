@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.estimation.set_membership import COARSER, COARSEST_STEP, SHAPE_STEP, SetMembership
+from ncs_gym.estimation.set_membership import SHAPE_STEP, SetMembership
 from ncs_gym.plants.hard_bounds import FLAT_INFLATION
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import is_inside
@@ -89,7 +89,6 @@ class ErrorRecursion:
         first: ErrorStatistics | None = None,
     ) -> None:
         self.plant, self.error_set, self._bits = plant, error_set, covariance_bits
-        self._quantization_step = quantization_step
         self.sets = SetMembership(plant, quantization_step, error_set, shape_step)
         self.Q, self.R = plant.kalman_covariances[0], _sensor_covariance(plant, quantization_step)
         if first is None:
@@ -100,14 +99,6 @@ class ErrorRecursion:
         # would where nothing disturbs any: covariances would not recur. Deviations are no smaller than this share of
         # the largest one, each in units of what the certified set allows.
         self._share, self._units = 2.0 ** -(covariance_bits + 4), np.sqrt(np.diag(error_set.shapes[0]))
-
-    def coarser(self) -> ErrorRecursion:
-        """Returns a recursion that rounds shapes up more coarsely, so that fewer differ; itself if it is coarse."""
-        coarser = min(COARSER * self.sets.shape_step, COARSEST_STEP)
-        if coarser <= self.sets.shape_step:
-            return self
-        settings = self._bits, coarser, self.first
-        return ErrorRecursion(self.plant, self._quantization_step, self.error_set, *settings)
 
     def predicted(self, statistics: ErrorStatistics) -> ErrorStatistics:
         """Returns the statistics one step later, without a sample."""
