@@ -218,51 +218,39 @@ def _is_sparse(value: Any) -> bool:
     return hasattr(value, "toarray") and hasattr(value, "nnz")
 
 
-def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np.ndarray:
-    """Returns `value` as a finite float64 matrix of the expected shape.
+def as_matrix(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
+    """Returns `value` as a finite float64 matrix, or a vector, of the expected shape.
 
     Args:
-        value: Anything numpy can turn into a two-dimensional array.
-        shape: Expected (rows, columns); None accepts any positive number.
+        value: Anything numpy can turn into an array.
+        shape: Expected (rows, columns), or (entries,); None accepts any positive number.
         name: What the error message calls it.
 
     Raises:
         ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
     """
-    matrix = as_setting(value)
-    if matrix is None and _is_sparse(value) and math.prod(value.shape) > MOST_EXPANDED:
+    array, kind = as_setting(value), "vector" if len(shape) == 1 else "matrix"
+    if array is None and _is_sparse(value) and math.prod(value.shape) > MOST_EXPANDED:
         sizes = " x ".join(map(str, value.shape))
         raise ValueError(
             f"{name} is a sparse matrix of {sizes} entries, which is not expanded beyond {MOST_EXPANDED:,} of them: "
             "reduce the model"
         )
-    if matrix is None:
-        raise ValueError(f"{name} must be a matrix of numbers, got {shown(value)}")
-    expected = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
-    fits = matrix.ndim == 2 and all(
-        have > 0 and (want is None or have == want) for have, want in zip(matrix.shape, shape, strict=True)
-    )
-    if not fits:
-        raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}")
-    if not (np.abs(matrix) < LARGEST_NUMBER).all():
-        raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(matrix.tolist())}")
-    return matrix
+    if array is None:
+        raise ValueError(f"{name} must be a {kind} of numbers, got {shown(value)}")
+    expected = str(tuple("any" if size is None else size for size in shape)).replace("'", "")
+    if array.ndim != len(shape) or not all(
+        have > 0 and want in (None, have) for have, want in zip(array.shape, shape, strict=True)
+    ):
+        raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+    if not (np.abs(array) < LARGEST_NUMBER).all():
+        raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(array.tolist())}")
+    return array
 
 
 def as_vector(value: Any, size: int | None, name: str) -> np.ndarray:
-    """Returns `value` as a finite float64 vector of the expected size (None: any).
-
-    Raises:
-        ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
-    """
-    vector = as_setting(value)
-    if vector is None:
-        raise ValueError(f"{name} must be a vector of numbers, got {shown(value)}")
-    if vector.ndim != 1 or vector.size == 0 or size not in (None, vector.size):
-        raise ValueError(f"{name} must have shape ({'any' if size is None else size},), got {vector.shape}")
-    if not (np.abs(vector) < LARGEST_NUMBER).all():
-        raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(vector.tolist())}")
-    return vector
+    """Returns `value` as a finite float64 vector of the expected size (None: any); for errors see `as_matrix`."""
+    return as_matrix(value, (size,), name)
 
 
 def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:

@@ -85,9 +85,9 @@ class UncertainSet(ReadOnlyArrays, ABC):
 
 
 def document_of(value: Any) -> Any:
-    """Returns a set, or what values of a plant are made of, as JSON values in which infinity is the text "inf"."""
-    if isinstance(value, UncertainSet):
-        return value.document
+    """Returns what has a document, or is a part of one, as JSON values in which infinity is the text "inf"."""
+    if hasattr(value, "document"):
+        return document_of(value.document)
     if isinstance(value, tuple | list):
         return [*map(document_of, value)]
     if isinstance(value, dict):

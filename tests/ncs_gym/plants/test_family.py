@@ -78,7 +78,7 @@ def between(function, ranges, count, seed=0):
 def test_bound_holds_every_member_exactly_and_is_not_far_larger(plant, members, widths):
     gauge = largest_gauge(plant, members, widths)
     assert 0.4 < gauge <= 1
-    assert plant.remainder.is_proved
+    assert plant.remainder.proved
 
 
 def test_members_inside_the_hull_leave_out_less_than_its_vertices():
