@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import sys
 import warnings
 from operator import attrgetter
@@ -16,8 +15,6 @@ import numpy as np
 LARGEST_NUMBER, SMALLEST_NUMBER = 1e75, 1e-75
 # Steps and environments are counted in 32 bits.
 LARGEST_COUNT = 2**31 - 1
-# A sparse matrix with more entries, zeros included, is not expanded.
-MOST_EXPANDED = 10_000_000
 # Messages quote no more of a value than this many letters, and names and phrases of plants have no more.
 MAX_QUOTED_LENGTH, LONGEST_TEXT = 200, 1000
 # What a covariance may lack of a symmetric, positive semidefinite one, in units of its deviations: a few roundings of
@@ -175,7 +172,7 @@ def as_numbers(value: Any) -> np.ndarray | None:
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
-        array = _as_array(value)
+        array = np.asarray(value)
         if isinstance(value, np.ma.MaskedArray) or array.dtype.kind not in "fiub":
             return None
         with np.errstate(all="ignore"):
@@ -202,20 +199,7 @@ def reason_of(error: BaseException) -> str:
 def as_setting(value: Any) -> np.ndarray | None:
     """Returns a new float64 array; None for what is not real numbers: text, truth values, complex or masked ones."""
     numbers = as_numbers(value)
-    return None if numbers is None or _as_array(value).dtype.kind == "b" else np.array(numbers)
-
-
-def _as_array(value: Any) -> np.ndarray:
-    """Returns an array, also of a sparse matrix of scipy, which numpy takes for an object, unless it is too large."""
-    array = np.asarray(value)
-    if array.dtype.kind == "O" and array.ndim == 0 and _is_sparse(value):
-        return value.toarray() if math.prod(value.shape) <= MOST_EXPANDED else array
-    return array
-
-
-def _is_sparse(value: Any) -> bool:
-    """Returns whether a value is a sparse matrix of scipy."""
-    return hasattr(value, "toarray") and hasattr(value, "nnz")
+    return None if numbers is None or np.asarray(value).dtype.kind == "b" else np.array(numbers)
 
 
 def as_matrix(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
@@ -230,12 +214,6 @@ def as_matrix(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarra
         ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
     """
     array, kind = as_setting(value), "vector" if len(shape) == 1 else "matrix"
-    if array is None and _is_sparse(value) and math.prod(value.shape) > MOST_EXPANDED:
-        sizes = " x ".join(map(str, value.shape))
-        raise ValueError(
-            f"{name} is a sparse matrix of {sizes} entries, which is not expanded beyond {MOST_EXPANDED:,} of them: "
-            "reduce the model"
-        )
     if array is None:
         raise ValueError(f"{name} must be a {kind} of numbers, got {shown(value)}")
     expected = str(tuple("any" if size is None else size for size in shape)).replace("'", "")

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from ncs_gym import (
     Bounds,
@@ -122,6 +123,7 @@ def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
         (lambda: Limits(input=1.0, rows=[([1.0], -1.0, 1.0)]), "rows of limits must be a list"),
         (lambda: Model(A, B, [[0.0, 0.0]], 0.1), "every row of H"),
         (lambda: Model(A, B, None, 0.1, at=3.0), "at must be a pair"),
+        (lambda: Model(csr_array(A), B, None, 0.1), "A must be a matrix of numbers"),
         (lambda: Model(A, B, None, 0.1, at=[0.5, 0.0]), r"the state in at=\(state, input\) must have shape"),
         (lambda: Model(A, B, None, 0.1, continuous=A), "^continuous must have shape"),
         (lambda: Model.sampled(A, B, [[1.0]], 0.1), "^C must have shape"),
