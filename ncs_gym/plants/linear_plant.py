@@ -102,13 +102,12 @@ class LinearPlant(BetweenSamples):
     def _name(self) -> None:
         """Keeps names and units of states and inputs."""
         labels = {} if self.labels is None else self.labels
-        if not isinstance(labels, Mapping) or not {*labels} <= {"states", "inputs"}:
+        fits = isinstance(labels, Mapping) and {*labels} <= {"states", "inputs"}
+        if not fits or not all(isinstance(each, Mapping) for each in labels.values()):
             form = '{"states": {name: unit, ...}, "inputs": {name: unit, ...}}'
             raise ValueError(f"labels must be {form}, either of which may be left out, got {shown(labels)}")
         for name, size, letter in (("state", self.n - self.past, "x"), ("input", self.m, "u")):
             given = labels.get(f"{name}s", {})
-            if not isinstance(given, Mapping):
-                raise ValueError(f"labels of {name}s must be a dictionary of names with units, got {shown(given)}")
             names = as_names([*given], tuple(f"{letter}{i + 1}" for i in range(size)), f"names of {name}s")
             units = as_units([*given.values()], size, f"units of {name}s")
             self._set(**{f"{name}_names": names, f"{name}_units": units})

@@ -248,18 +248,15 @@ def grid_size(parameters: int) -> int:
     return max(int(GRID ** (1.0 / parameters) + 1e-9), 3)
 
 
-def matrices_of(plant: Any, shape: tuple[int, ...], center: np.ndarray) -> np.ndarray:
+def matrices_of(plant: LinearPlant, shape: tuple[int, ...], center: np.ndarray) -> np.ndarray:
     """Returns [A, B, s] of a plant in deviations from a state and input, (n + m,), where its step is s.
 
     It is at rest at its own operating point (x_i, u_i): s = (A - I)(x - x_i) + B (u - u_i), rounded once.
 
     Raises:
-        ValueError: If it is no plant, or of another shape.
+        ValueError: If it is of another shape.
     """
-    A, B = getattr(plant, "A", None), getattr(plant, "B", None)
-    if not isinstance(A, np.ndarray) or not isinstance(B, np.ndarray):
-        raise ValueError(f"the function of a family must return a LinearPlant, got {shown(plant)}")
-    n, m = B.shape
+    A, B, (n, m) = plant.A, plant.B, plant.B.shape
     if (n, n + m + 1) != shape:
         wanted = (shape[0], shape[1] - 1)
         raise ValueError(f"the plants of a family must have [A, B] of the same shape {wanted}, got {(n, n + m)}")

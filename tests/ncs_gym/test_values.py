@@ -110,7 +110,7 @@ def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
         (lambda: LinearPlant(MODEL, Limits([1.0], 1.0), BOUNDS), r"state limits must be \(low, high\)"),
         (lambda: LinearPlant(MODEL, LIMITS, Bounds([0.1] * 3, 0.1, 0.1)), r"Bounds\(disturbance=...\)"),
         (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"outputs": {}}), 'labels must be {"states": {name: unit'),
-        (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"states": ["x", "y"]}), "a dictionary of names"),
+        (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"states": ["x", "y"]}), "labels must be"),
         (lambda: LinearPlant(ABOUT, LIMITS, BOUNDS), "as beside at= of a Model, where"),
         (lambda: LinearPlant(MODEL, Limits((-1.0, 5.0), 1.0), BOUNDS), "positive half-widths"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], (0.0, 5.0)), BOUNDS), "limits are absolute"),
