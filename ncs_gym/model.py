@@ -168,11 +168,13 @@ class Model(ReadOnlyArrays):
             )
         if own is None and type(system).__module__.startswith("scipy."):
             own = 0  # of its models in continuous time
-        if own is None or (dt is None and (own is True or own == 0)):
+        if own is None:
             raise ValueError(
-                f"the model has dt={own}: give dt, the duration of a step in seconds, and a model that says with dt=0 "
-                "whether it is in continuous time"
+                "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with "
+                "dt=0 or with its sampling time in seconds"
             )
+        if dt is None and (own is True or own == 0):
+            raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
         dt = as_number(own if dt is None else dt, "dt", low=0.0, low_open=True)
         if own is not True and own == 0:
             return cls.sampled(A, B, C, dt, at)
