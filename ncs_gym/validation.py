@@ -306,11 +306,6 @@ def as_names(value: Any, default: tuple[str, ...], name: str) -> tuple[str, ...]
     return tuple(value) or default
 
 
-def as_units(value: Any, count: int, name: str) -> tuple[str, ...]:
-    """Returns units, as texts; "" for those without, as the unit "1" stands for. For errors see `as_names`."""
-    return tuple("" if unit == "1" else unit for unit in as_names(value, ("",) * count, name))
-
-
 def require_short_text(text: str, name: str) -> None:
     """Raises ValueError unless a text has at most `LONGEST_TEXT` letters, which a terminal prints as they are."""
     if len(text) > LONGEST_TEXT or not text.isprintable():

@@ -23,7 +23,7 @@ from ncs_gym.plants.past_inputs import with_past_inputs
 from ncs_gym.plants.resting_point import at_rest, with_residual
 from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, read_back
-from ncs_gym.validation import as_names, as_numbers, as_units, counted, read_only, reason_of, shown
+from ncs_gym.validation import as_names, as_numbers, counted, read_only, reason_of, shown
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -109,7 +109,8 @@ class LinearPlant(BetweenSamples):
         for name, size, letter in (("state", self.n - self.past, "x"), ("input", self.m, "u")):
             given = labels.get(f"{name}s", {})
             names = as_names([*given], tuple(f"{letter}{i + 1}" for i in range(size)), f"names of {name}s")
-            units = as_units([*given.values()], size, f"units of {name}s")
+            units = as_names([*given.values()], ("",) * size, f"units of {name}s")
+            units = tuple("" if unit == "1" else unit for unit in units)
             self._set(**{f"{name}_names": names, f"{name}_units": units})
         ages = [counted(age, "step") for age in range(self.past // self.m, 0, -1)]
         past = tuple(f"{name} of {age} ago" for age in ages for name in self.input_names)

@@ -139,8 +139,7 @@ class BoxDisturbance(Disturbance):
         widths = as_vector(self.half_widths, None, "half_widths")
         if (widths < 0.0).any():
             raise ValueError(f"half_widths must be >= 0, got {widths.tolist()}")
-        object.__setattr__(self, "half_widths", widths)
-        self._make_arrays_read_only()
+        self._set(half_widths=widths)
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         widths = np.sqrt(plant.gamma / plant.n) if self.half_widths is None else np.asarray(self.half_widths)
@@ -182,7 +181,7 @@ class SinusoidDisturbance(Disturbance):
     vectorized: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "period", as_number(self.period, "period", low=0.0, low_open=True))
+        self._set(period=as_number(self.period, "period", low=0.0, low_open=True))
 
     def begin(self, rng, plant, size=None):  # noqa: D102
         axes = np.sqrt(plant.gamma) * _unit_ball(plant.n).sample_boundary(rng, size)
@@ -270,10 +269,9 @@ class AdversarialDisturbance(Disturbance):
 
     def __post_init__(self) -> None:
         if self.M is not None:
-            object.__setattr__(self, "M", as_covariance(self.M, None, "M"))
+            self._set(M=as_covariance(self.M, None, "M"))
         if self.rows is not None:
-            object.__setattr__(self, "rows", as_matrix(self.rows, (None, None), "rows"))
-        self._make_arrays_read_only()
+            self._set(rows=as_matrix(self.rows, (None, None), "rows"))
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         bound = plant.nominal_disturbance
