@@ -36,7 +36,7 @@ MAX_GRAPHS = 32
 # The arrays of a graph, whose last axis is the history.
 _BY_HISTORY = (
     *("present", "replay_from", "target", "new_age", "accepted", "arrival", "used"),
-    *("_priors", "_held", "_recurs", "next"),
+    *("_priors", "_held", "next"),
 )
 
 
@@ -51,7 +51,6 @@ class ArrivalHistories:
     Args:
         recursion: Moves the error statistics.
         channel: Gives the length of the replay buffer.
-        table: Error statistics to begin with; none by default.
 
     Attributes:
         recursion: The same.
@@ -70,12 +69,12 @@ class ArrivalHistories:
         used: Statistics before the update at each age, NO_SAMPLE without one, shape (buffer + 1, capacity).
     """
 
-    def __init__(self, recursion: ErrorRecursion, channel: Channel, table: ErrorTable | None = None) -> None:
+    def __init__(self, recursion: ErrorRecursion, channel: Channel) -> None:
         self.recursion, self.channel = recursion, channel
         self.buffer, size = channel.longest_delay, FIRST_CAPACITY
         # Ages above this make no difference: neither to a certified set nor to what the buffer holds.
         oldest = max(self.buffer + 1, recursion.error_set.oldest + 1)
-        self.table = ErrorTable(recursion, oldest) if table is None else table
+        self.table = ErrorTable(recursion, oldest)
         held_ages = self.buffer + 1
         self._key = f"{held_ages + 2}q{held_ages}?"
         self._count = 0
@@ -84,7 +83,6 @@ class ArrivalHistories:
         self.present, self.replay_from, self.next, self.target, self.new_age = np.zeros((5, size), np.int64)
         self.arrival, self.used, self._priors = np.zeros((3, held_ages, size), np.int64)
         self._held, self.accepted = np.zeros((held_ages, size), np.bool_), np.zeros(size, np.bool_)
-        self._recurs = np.zeros(size, np.bool_)  # whether a step led here more than once
         self._ahead: dict[int, np.ndarray] = {}  # by number of steps, then by number of the statistics
         self._lock = threading.RLock()
         # Weak, or an estimator that never moves on from this graph would keep all that came after it.
@@ -115,8 +113,6 @@ class ArrivalHistories:
                 predicted = self.table.after_step(present)
                 after = self._number_of(predicted, (predicted, *priors[:-1]), (False, *held[:-1]), NO_REPLAY)
                 self.next[history] = after
-        else:
-            self._recurs[after] = True
         return after
 
     def after_arrival(self, history: int, age: int) -> int:
@@ -184,16 +180,11 @@ class ArrivalHistories:
         return False
 
     def keeping(self, histories: np.ndarray) -> tuple[ArrivalHistories, np.ndarray]:
-        """Returns a graph with some histories, shape (k,), only, and their numbers there.
-
-        Error statistics that recurred are kept as well, since they take the longest to work out.
-        """
+        """Returns a graph with some histories, shape (k,), only, and their numbers there."""
         with self._lock:
             successor = None if self._successor is None else self._successor()
             if successor is None or successor.is_full:
-                self.table.mark(self.present[: self._count][self._recurs[: self._count]])
-                table = self.table.recurring(MAX_BYTES // (4 * self.table.bytes_each))
-                successor = ArrivalHistories(self.recursion, self.channel, table)
+                successor = ArrivalHistories(self.recursion, self.channel)
                 self._successor = weakref.ref(successor)
             with _shared_lock:
                 for key, shared in _shared.items():
@@ -234,7 +225,7 @@ class ArrivalHistories:
             self._priors[:, number], self._held[:, number] = priors, held
             self.next[number] = self.arrival[:, number] = self.new_age[number] = UNKNOWN
             self.target[number] = number if replay_from == NO_REPLAY else UNKNOWN
-            self.accepted[number], self._recurs[number], self.used[:, number] = False, False, NO_SAMPLE
+            self.accepted[number], self.used[:, number] = False, NO_SAMPLE
             self._count = number + 1
             self._numbers[key] = number  # last: if this is interrupted, the history has not occurred
             size = self._count * self._bytes_each + len(self.table) * self.table.bytes_each
