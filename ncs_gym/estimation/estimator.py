@@ -108,11 +108,10 @@ class Estimator(PastSteps):
         histories: ArrivalHistories | None = None,
         after: Estimator | None = None,
     ) -> None:
-        if histories is None and error_set is None:
-            histories = arrival_histories(plant, channel, None)
-        elif histories is None:
+        if error_set is not None and histories is None:
             require_error_set(error_set, plant)
             histories = histories_of(plant, channel, error_set)
+        histories = arrival_histories(plant, channel, None) if histories is None else histories
         super().__init__(plant, histories)
         self._usual, self.channel, self.error_set = histories, channel, histories.recursion.error_set
         contract = self.error_set.contract
