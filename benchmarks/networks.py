@@ -591,7 +591,7 @@ def gains_taken(env_id: str, episodes: int, seed: int = 0) -> Counter[str]:
         env.reset(seed=seed + episode)
         for _ in range(gym.spec(env_id).max_episode_steps or 200):
             env.step(env.action_space.sample())
-    assert env._now.estimator._histories is histories  # no history was forgotten, with it the counts
+    assert env._now.estimator.histories is histories  # no history was forgotten, with it the counts
     return counts
 
 

@@ -157,7 +157,7 @@ def largest_share(plant: LinearPlant) -> float | None:
     model = sparse.hstack([pushed, moved]).tocsr()
     row = np.abs(plant.box).argmax(axis=0)  # of each state
     states = np.sort(plant.box_ends[:, row] / plant.box.sum(axis=0), axis=0)
-    inputs = np.stack([plant.input_low, plant.input_high])
+    inputs = plant.input_ends
     ends = np.concatenate([np.tile(inputs, _STEPS), np.tile(states, _STEPS)], axis=1).T
     first = np.zeros(n * _STEPS)
     kept = 0

@@ -248,15 +248,15 @@ def _overridden(certificate: Any, env: NCSEnv, noise: float, steps: int, numbers
         filtered = BoardFilter(numbers, 0, state)
     for step in range(steps):
         if step % HELD == 0:
-            push = noise * rng.uniform(plant.input_low, plant.input_high)
+            push = noise * rng.uniform(*plant.input_ends)
         if numbers is None:
-            wanted = np.clip(push + certificate.K @ loop.receive(packets), plant.input_low, plant.input_high)
+            wanted = np.clip(push + certificate.K @ loop.receive(packets), *plant.input_ends)
             u = loop.decide(wanted).input
             assert loop.guaranteed, loop.reason
         else:
             for packet in sorted(packets, key=lambda each: each.stamp):
                 filtered.receive(packet.episode, packet.stamp, packet.measurement)
-            wanted = np.clip(push + certificate.K @ filtered.estimate, plant.input_low, plant.input_high)
+            wanted = np.clip(push + certificate.K @ filtered.estimate, *plant.input_ends)
             u = filtered.decide(wanted)[1]
             assert filtered.reason == GUARANTEED
         count += bool((u != wanted).any())

@@ -118,7 +118,7 @@ def by_ladder(recursion: ErrorRecursion, outage: int, gap: int) -> float:
 
     What happens between two rungs is then known offline. (C2) ends it.
     """
-    certified = recursion.error_set.shape_at(0)
+    certified = recursion.error_set.shapes[0]
     inward = np.linalg.inv(np.linalg.cholesky(certified))
     known = recursion.first
     for steps in range(1 - outage, LONGEST_LADDER):

@@ -10,7 +10,7 @@ from ncs_gym.estimation.error_bound import ErrorSetError, UnstablePlantError, ce
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.installation import warn_of_overwritten_packages
-from ncs_gym.limits import ChosenLimitsWarning, Limits
+from ncs_gym.limits import Limits
 from ncs_gym.model import Model
 from ncs_gym.network.actuator import Actuator, Command, Echo
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
@@ -67,7 +67,6 @@ __all__ = [
     "BrokenContractWarning",
     "Channel",
     "ChannelContract",
-    "ChosenLimitsWarning",
     "ClippedObservationWarning",
     "Command",
     "Disturbance",

@@ -38,15 +38,13 @@ class Box(UncertainSet):
     def __post_init__(self) -> None:
         ends: list[Any] = [as_setting(self.low), as_setting(self.high)]
         fits = all(each is not None and each.ndim <= 1 and each.size and np.isfinite(each).all() for each in ends)
-        if not fits or len({*map(np.shape, ends)} - {()}) > 1:
-            found = f"{shown(self.low)} and {shown(self.high)}"
-            raise ValueError(f"a box needs two finite ends, numbers or vectors of one size, got {found}")
-        low, high = np.array(np.broadcast_arrays(*ends))
+        fits = fits and len({*map(np.shape, ends)} - {()}) <= 1
+        low, high = np.array(np.broadcast_arrays(*ends)) if fits else np.array([1.0, 0.0])
         self._set(low=low, high=high, middle=0.5 * (high + low), size=low.size if low.ndim else None)
         if not ((self.half == 0.0) | (self.half >= SMALLEST_SIZE) & (self.half <= LARGEST_SIZE)).all():
-            allowed = f"0 or from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
             raise ValueError(
-                f"half-widths of a box must be {allowed}, with low <= high, got {shown(self.half.tolist())}"
+                "a box needs two finite ends, low <= high, numbers or vectors of one size, half-widths being 0 or from "
+                f"{SMALLEST_SIZE:g} to {LARGEST_SIZE:g}, got {shown(self.low)} and {shown(self.high)}"
             )
 
     @cached_property
@@ -133,11 +131,11 @@ class Through(UncertainSet):
     def __post_init__(self) -> None:
         E = as_matrix(self.E, (None, None), "E of a set through E")
         own = as_set(self.set).sized(E.shape[1])
-        parts = Sum((own,)).parts
-        if any(isinstance(each, Gaussian) for each in parts):
-            raise ValueError("a Gaussian through E is a Gaussian of covariance E P E': give that one")
-        if any(each.is_left_out for each in parts):
-            raise ValueError("what a model leaves out is not taken through E: give the remainder of the states itself")
+        if any(isinstance(each, Gaussian) or each.is_left_out for each in Sum((own,)).parts):
+            raise ValueError(
+                "a Gaussian or a remainder is not taken through E: give a Gaussian of covariance E P E', or the "
+                "remainder of the states itself"
+            )
         self._set(E=E, set=own, size=len(E), middle=E @ np.broadcast_to(own.middle, E.shape[1]))
         self.ellipsoid()
 

@@ -1,9 +1,11 @@
-"""The limits of a plant: what they are as given, and the rows that they are around the point of a model."""
+"""The limits of a plant: what they are as given, and the rows that they are around a point."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,20 +19,14 @@ from ncs_gym.validation import (
     as_count,
     as_given,
     as_setting,
+    read_only,
     shown,
-    warn_caller,
 )
 
 # Ends that differ from symmetric ones by less, relative to the nearer one, are symmetric: that is rounding.
 NEARLY_SYMMETRIC = 1e-12
-# A state that the box says nothing of is as large as this many times what it reaches from rest in n steps.
-FREE_REACH = 100.0
 # Times of a step at which limits of states may count.
 MOST_POINTS = 64
-
-
-class ChosenLimitsWarning(UserWarning):
-    """No state has a limit: half-widths of the safe box were chosen, far beyond what inputs reach in a few steps."""
 
 
 class Rows(NamedTuple):
@@ -39,75 +35,216 @@ class Rows(NamedTuple):
     Attributes:
         rows: c, shape (k, n) or (k, n + m): half the range of a row is 1; where an end is infinite, the other one is -1
             or 1.
-        low, high: Their ends, shape (k,); infinite where there is none.
+        ends: Their low and their high ends, shape (2, k); infinite where there is none.
     """
 
     rows: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    ends: np.ndarray
 
     @classmethod
-    def of(cls, rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Rows:
-        """Returns those of rows, (k, n), with ends in their own units that have any finite end."""
-        limited = np.isfinite(low) | np.isfinite(high)
-        rows, low, high = rows[limited], low[limited], high[limited]
+    def of(cls, rows: np.ndarray, ends: np.ndarray) -> Rows:
+        """Returns those of rows, (k, n), with ends in their own units, (2, k), that have any finite end."""
+        limited = np.isfinite(ends).any(axis=0)
+        rows, (low, high) = rows[limited], ends[:, limited]
         half = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * (high - low), np.minimum(-low, high))
-        return cls((1.0 / half)[:, None] * rows, low / half, high / half)
-
-    def around(self, point: np.ndarray) -> Rows:
-        """Returns the same limits in deviations from a point, shape (n,) or (n + m,)."""
-        at_point = exact.product(self.rows, point)
-        return Rows(self.rows, self.low - at_point, self.high - at_point)
+        return cls((1.0 / half)[:, None] * rows, np.array([low, high]) / half)
 
     @classmethod
     def joined(cls, parts: Sequence[Rows], size: int) -> Rows:
         """Returns all rows of several, each with this many entries."""
-        none = Rows(np.empty((0, size)), np.empty(0), np.empty(0))
-        return cls(*(np.concatenate(each) for each in zip(none, *parts, strict=True)))
+        rows, ends = [np.empty((0, size))], [np.empty((2, 0))]
+        return cls(
+            np.concatenate(rows + [each.rows for each in parts]),
+            np.concatenate(ends + [each.ends for each in parts], axis=1),
+        )
 
 
-class Deviations(NamedTuple):
-    """The equations and the limits of a plant, counted from a point.
+class LimitValues(ReadOnlyArrays):
+    """The equations and the limits of a plant, counted from a point; past inputs are the last states.
 
     Attributes:
-        A, B, H: Of the states, of which past inputs are the last ones.
-        box: Rows of states.
-        inputs: The low and the high ends of the inputs, shape (2, m).
-        mixed: Rows of states and inputs together.
-        state, input: The point, shapes (n,) and (m,).
-        step_offset: Sizes of the constant that it rests under, shape (n,).
-        lacking: What it lacks of an equilibrium by rounding, in size, of the own states.
-        past: Number of past inputs, the newest ones last.
+        A: State matrix, shape (n, n), past inputs included.
+        B: Input matrix, shape (n, m).
+        H: Output matrix, shape (p, n).
+        past: How many of the last states are past inputs, the newest ones last.
+        box: Rows c_j of the safe box, shape (k, n), in units of half the range that is allowed; where one end is open,
+            the other one is 1 unit away.
+        box_ends: The low and the high ends of c_j x, shape (2, k); -1 and 1 where limits are symmetric, infinite where
+            there is none.
+        is_past_row: Which rows limit past inputs, which nothing ever takes there, shape (k,).
+        mixed_rows: Rows of limits on (x, u) at the beginning of a step, shape (q, n + m), in units as those of `box`.
+        mixed_ends: Their low and high ends, shape (2, q).
+        input_ends: The low and the high ends of the inputs, shape (2, m).
+        operating_state: State that deviations are counted from, shape (n,); for conversion and text.
+        operating_input: Input that deviations are counted from, shape (m,).
+        step_offset: Sizes of what the operating point rests under in every step beside A and B, shape (n,), which do
+            not cancel: |offset|, and |E| |middle| of a disturbance with two ends.
+        lacking: What the point lacks of an equilibrium by rounding, in size, of the model's own states.
     """
 
     A: np.ndarray
     B: np.ndarray
     H: np.ndarray
-    box: Rows
-    inputs: np.ndarray
-    mixed: Rows
-    state: np.ndarray
-    input: np.ndarray
+    past: int
+    box: np.ndarray
+    box_ends: np.ndarray
+    is_past_row: np.ndarray
+    mixed_rows: np.ndarray
+    mixed_ends: np.ndarray
+    input_ends: np.ndarray
+    operating_state: np.ndarray
+    operating_input: np.ndarray
     step_offset: np.ndarray
     lacking: np.ndarray
-    past: int = 0
 
-    def around(self, x: np.ndarray, u: np.ndarray) -> Deviations:
+    def replaced(self, **changes: Any) -> LimitValues:
+        """Returns the same with some of these attributes changed."""
+        made = LimitValues()
+        made._set(**self.values | changes)
+        return made
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """All attributes, by their names."""
+        return {name: getattr(self, name) for name in LimitValues.__annotations__}
+
+    def around(self, x: np.ndarray, u: np.ndarray) -> LimitValues:
         """Returns the same plant counted from another point, which is (x, u) from here: its ends move."""
-        box, mixed = self.box.around(x), self.mixed.around(np.concatenate([x, u]))
-        return self._replace(box=box, inputs=self.inputs - u, mixed=mixed, state=self.state + x, input=self.input + u)
+        return self.replaced(
+            box_ends=self.box_ends - exact.product(self.box, x),
+            mixed_ends=self.mixed_ends - exact.product(self.mixed_rows, np.concatenate([x, u])),
+            input_ends=self.input_ends - u,
+            operating_state=self.operating_state + x,
+            operating_input=self.operating_input + u,
+        )
 
     @property
     def is_within(self) -> bool:
         """Whether the point is strictly within the limits."""
-        return all(((low < 0.0) & (high > 0.0)).all() for low, high in (self.box[1:], self.inputs, self.mixed[1:]))
+        low, high = np.concatenate([self.box_ends, self.input_ends, self.mixed_ends], axis=1)
+        return bool(((low < 0.0) & (high > 0.0)).all())
+
+    @cached_property
+    def spectral_radius(self) -> float:
+        """Largest absolute eigenvalue of A; below 1 exactly when the plant is Schur stable."""
+        return float(np.abs(np.linalg.eigvals(self.A)).max())
+
+    @cached_property
+    def is_symmetric(self) -> bool:
+        """Whether the limits are |c_j x| <= 1 and |u_i| <= u_max_i, and no others."""
+        low, high = np.concatenate([self.box_ends, self.input_ends], axis=1)
+        units = high[: len(self.box)] == 1.0
+        return bool(units.all()) and np.array_equal(-low, high) and not len(self.mixed_rows)
+
+    @property
+    def box_rows(self) -> np.ndarray:
+        """Rows c_j of a symmetric safe box |c_j x| <= 1, shape (k, n); raises ValueError if limits are others."""
+        return self._if_symmetric(self.box)
+
+    @property
+    def u_max(self) -> np.ndarray:
+        """Symmetric limits |u_i| <= u_max_i, shape (m,); raises ValueError if limits are others."""
+        return self._if_symmetric(self.input_ends[1])
+
+    def _if_symmetric(self, value: np.ndarray) -> np.ndarray:
+        if not self.is_symmetric:
+            raise ValueError(
+                "the limits of this plant are not |c_j x| <= 1 and |u_i| <= u_max_i alone, and only these are taken by "
+                "what was asked for (a plant has box, box_ends, input_ends, mixed_rows and mixed_ends)"
+            )
+        return value
+
+    @cached_property
+    def input_middle(self) -> np.ndarray:
+        """The input that action 0 stands for, shape (m,): the middle of the limits."""
+        return read_only(0.5 * self.input_ends.sum(axis=0))
+
+    @cached_property
+    def input_half(self) -> np.ndarray:
+        """Half the range of each input, shape (m,): input_middle +- this is within the limits, as floats add."""
+        (low, high), middle = self.input_ends, self.input_middle
+        half = 0.5 * (high - low)
+        while (beyond := (middle + half > high) | (middle - half < low)).any():
+            half = np.where(beyond, np.nextafter(half, 0.0), half)
+        return read_only(half)
+
+    @cached_property
+    def input_scales(self) -> tuple[tuple[float, float], ...]:
+        """`input_middle` and `input_half` of each input as numbers."""
+        return tuple(zip(self.input_middle.tolist(), self.input_half.tolist(), strict=True))
+
+    @cached_property
+    def largest_input(self) -> np.ndarray:
+        """The largest |u_i| within the limits, shape (m,)."""
+        return read_only(np.abs(self.input_ends).max(axis=0))
+
+    @cached_property
+    def own_limits(self) -> np.ndarray:
+        """The closest limits of each state alone, low and high ends of shape (2, n); infinite where an end is open."""
+        low, high = np.full((2, len(self.A)), [[-np.inf], [np.inf]])
+        for row, ends in zip(self.box, self.box_ends.T, strict=True):
+            if np.count_nonzero(row) == 1:
+                j = int(np.flatnonzero(row)[0])
+                least, most = sorted(ends / row[j])
+                low[j], high[j] = max(low[j], least), min(high[j], most)
+        return read_only(np.array([low, high]))
+
+    @cached_property
+    def reach(self) -> np.ndarray:
+        """The largest |x_j| in the safe box and |u_i| within the limits, shape (n + m,); infinite for a free state.
+
+        Of states that are past inputs those are the inputs' limits, which they never leave.
+        """
+        n, m = self.B.shape
+        two_ends = np.isfinite(self.box_ends).all(axis=0)
+        limited, reach = self.box[two_ends].any(axis=0), np.full(n, np.inf)
+        with suppress(ZeroDivisionError):  # rows that limit a sum alone
+            reach[limited] = self._widest(limited)
+        reach = np.minimum(reach, np.abs(self.own_limits).max(axis=0))
+        reach[n - self.past :] = np.tile(self.largest_input, self.past // m)
+        return read_only(np.concatenate([reach, self.largest_input]))
+
+    def _widest(self, states: Any = slice(None)) -> np.ndarray:
+        """Returns bounds of some |x_i| in the safe box: x = (C'C)^-1 C' (C x) for the rows C that have two ends.
+
+        Raises:
+            ZeroDivisionError: If the box does not bound each of these.
+        """
+        bounded = np.isfinite(self.box_ends).all(axis=0)
+        rows, sizes = self.box[:, states][bounded], np.abs(self.box_ends[:, bounded]).max(axis=0)
+        gram = exact.product(rows.T, rows)
+        return (np.abs(exact.product(exact.inverse(gram), rows.T)) * sizes).sum(axis=1)
+
+    def constraint_values(self, state: np.ndarray) -> np.ndarray:
+        """Returns how far c_j x is beyond the nearer end, in units of half the range, for each row of the safe box.
+
+        Shape (k,) or (k, N); positive is violated. With symmetric limits that is |c_j x| - 1.
+        """
+        return _beyond(self.box.dot(state), self.box_ends)
+
+    def mixed_values(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns how far the rows of `mixed_rows` are beyond the nearer end, in units of half their range.
+
+        Shape (q,) or (q, N), for states of shape (n,) or (n, N) and inputs of shape (m,) or (m, N).
+        """
+        rows, n = self.mixed_rows, len(self.A)
+        return _beyond(rows[:, :n].dot(state) + rows[:, n:].dot(u), self.mixed_ends)
+
+    def values_at_start(self, state: np.ndarray) -> np.ndarray:
+        """Returns `worst_constraint_values` where no step has been: those of a state at which the operating input acts.
+
+        Shape (k + q,) or (k + q, N), for a state of shape (n,) or (n, N).
+        """
+        values = self.constraint_values(state)
+        if not len(self.mixed_rows):
+            return values
+        return np.concatenate([values, self.mixed_values(state, np.zeros((self.B.shape[1], *state.shape[1:])))])
 
 
-def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Returns a bound on every |x_j|, shape (n,), n steps after |x| <= reach, (n,), with |u| <= largest_input, (m,)."""
-    for _ in range(len(A)):
-        reach = exact.product(np.abs(np.hstack([A, B])), np.concatenate([reach, largest_input]))
-    return reach
+def _beyond(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Returns how far values, shape (k,) or (k, N), are beyond the nearer of their ends, shape (2, k)."""
+    low, high = ends if values.ndim == 1 else ends[:, :, None]
+    return np.maximum(values - high, low - values)
 
 
 def sides(limits: Any, size: int, name: str) -> np.ndarray:
@@ -122,44 +259,30 @@ def sides(limits: Any, size: int, name: str) -> np.ndarray:
         ValueError: If it is no such pair, or a low end is not below the high one.
     """
     ends: list[Any] = [as_setting(side) for side in limits] if isinstance(limits, (tuple, list, np.ndarray)) else []
-    if len(ends) != 2 or any(side is None or side.shape not in ((), (size,)) or np.isnan(side).any() for side in ends):
-        raise ValueError(f"{name} must be a pair (low, high), each a number or shape ({size},), got {shown(limits)}")
-    low, high = both = np.array([np.broadcast_to(side, (size,)) for side in ends])
-    if not (low < high).all():
+    fits = len(ends) == 2 and all(side is not None and side.shape in ((), (size,)) for side in ends)
+    both = np.array([np.broadcast_to(side, (size,)) for side in ends]) if fits else np.zeros((2, 1))
+    if not (both[0] < both[1]).all():
         raise ValueError(
-            f"{name} must be (low, high), each a number or a vector, with low < high everywhere: give all low "
+            f"{name} must be (low, high), each a number or of shape ({size},), with low < high everywhere: all low "
             f"ends, then all high ones, got {shown(limits)}"
         )
     return both
 
 
-def _from_center(limits: Any, center: np.ndarray, name: str, *, is_given: bool = True) -> np.ndarray:
+def _from_center(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
     """Returns the ends of limits as distances from a point between them, shape (2, size); infinite where free.
-
-    `is_given` tells whether somebody gave that point.
 
     Raises:
         ValueError: If they are no limits, or the point is not strictly between them, by more than rounding.
     """
-    low, high = sides(limits, len(center), name)
-    if not ((low < center) & (center < high)).all():
-        at_end, remedy = np.flatnonzero((low == center) | (center == high)), ""
-        if not is_given:
-            remedy = ": limits are absolute, so give at=(state, input) of the Model, around which they are"
-        elif len(at_end):
-            remedy = (
-                f": entry {at_end[0] + 1} rests at its end, from where nothing can move it both ways; give an "
-                "equilibrium whose states and inputs are inside their limits"
-            )
-        raise ValueError(
-            f"{name} must have the operating point {shown(center.tolist())} strictly between them, got {shown(limits)}"
-            f"{remedy}"
-        )
-    ends = np.array([low - center, high - center])
+    ends = sides(limits, len(center), name) - center
     finite = np.isfinite(ends)
-    sizes = np.where(finite, np.abs(ends), 1.0)
+    sizes = np.where(finite, np.array([[-1.0], [1.0]]) * ends, 1.0)
     if not ((sizes > SMALLEST_NUMBER) & (sizes < LARGEST_NUMBER)).all():
-        raise ValueError(f"{name} must be finite numbers of usual size, or infinite, got {shown(limits)}")
+        raise ValueError(
+            f"{name} are absolute numbers of usual size, or infinite, and must have the operating point, at=(state, "
+            f"input) of the Model, strictly between them: it is {shown(center.tolist())}, got {shown(limits)}"
+        )
     nearest = sizes.min(axis=0)
     nearly = finite.all(axis=0) & (np.abs(sizes[1] - sizes[0]) <= NEARLY_SYMMETRIC * nearest)
     return np.where(nearly, [-nearest, nearest], ends)
@@ -198,44 +321,45 @@ class Limits(ReadOnlyArrays):
         self._set(**{name: as_given(getattr(self, name)) for name in ("state", "input", "rows", "rate")})
         self._set(between_samples=None if points == 1 else points)
 
-    def around(self, model: Model) -> Deviations:
+    def around(self, model: Model) -> LimitValues:
         """Returns a model with these limits, counted from its point.
 
         Raises:
             ValueError: If they are no limits of its states and inputs, or its point is not strictly within them.
         """
-        point, n = np.concatenate([model.state, model.input]), len(model.A)
+        point, (n, m) = np.concatenate([model.state, model.input]), model.B.shape
         of_states, mixed = [], []
         if self.state is not None:
-            of_states.append(Rows.of(np.eye(n), *self._ends("state", model)))
-        inputs = self._ends("input", model)
+            of_states.append(Rows.of(np.eye(n), _from_center(self._pair("state", model), model.state, "state limits")))
+        inputs = _from_center(self._pair("input", model), model.input, "input limits")
         if not np.isfinite(inputs).all():
             raise ValueError(
                 "input limits must be finite, since actions from -1 to 1 stand for inputs from the low to the high "
                 f"end, got {shown(self.input)}"
             )
         for of_state, of_input, low, high in self.rows:
-            c = np.zeros(len(point))
-            c[:n] = as_point(of_state, n, "c_x of a row of limits")
-            if of_input is not None:
-                c[n:] = as_point(of_input, len(point) - n, "c_u of a row of limits")
-            if np.abs(c).max() < SMALLEST_NUMBER or (of_input is not None and np.abs(c[n:]).max() < SMALLEST_NUMBER):
-                raise ValueError(f"every row of limits must limit something, with c_u None or not 0, got {shown(c)}")
-            ends = _from_center((low, high), exact.product(c[None], point), "the ends of a row of limits")
-            if of_input is None:
-                of_states.append(Rows.of(c[None, :n], *ends))
-            else:
-                mixed.append(Rows.of(c[None], *ends))
-        box = Rows.joined(of_states or [_chosen(model, inputs)], n)
+            c_x = as_point(of_state, n, "c_x of a row of limits")
+            c_u = np.zeros(m) if of_input is None else as_point(of_input, m, "c_u of a row of limits")
+            if np.abs(c_x if of_input is None else c_u).max() < SMALLEST_NUMBER:
+                raise ValueError(f"every row of limits must limit something, with c_u None or not 0, got {shown(c_x)}")
+            c = np.concatenate([c_x, c_u])[None]
+            ends = _from_center((low, high), exact.product(c, point), "the ends of a row of limits")
+            (of_states if of_input is None else mixed).append(Rows.of(c[:, :n] if of_input is None else c, ends))
+        box, together = Rows.joined(of_states, n), Rows.joined(mixed, n + m)
         if not len(box.rows):
-            raise ValueError("limits of states are all infinite: give at least one finite one")
-        equations = model.A, model.B, model.H, box, inputs, Rows.joined(mixed, len(point))
-        return Deviations(*equations, model.state, model.input, model.step_offset, np.abs(model.lacking))
+            raise ValueError("no limit of a state is finite: give Limits(state=...) or rows, if generous ones")
+        values = LimitValues()
+        values._set(A=model.A, B=model.B, H=model.H, past=0, is_past_row=np.zeros(len(box.rows), np.bool_))
+        values._set(box=box.rows, box_ends=box.ends, mixed_rows=together.rows, mixed_ends=together.ends)
+        values._set(input_ends=inputs, operating_state=model.state, operating_input=model.input)
+        values._set(
+            step_offset=np.zeros(n) if model.offset is None else np.abs(model.offset), lacking=np.abs(model.lacking)
+        )
+        return values
 
     def absolute(self, model: Model) -> Limits:
         """Returns the same limits of a model about zero as pairs, which stay where they are beside any point."""
-        state = None if self.state is None else self._pair("state", model)
-        return replace(self, state=state, input=self._pair("input", model))
+        return replace(self, state=self._pair("state", model), input=self._pair("input", model))
 
     def change_within(self, half: np.ndarray) -> np.ndarray | None:
         """Returns the largest change of each input, shape (m,), given half their range; None if any is allowed.
@@ -246,50 +370,23 @@ class Limits(ReadOnlyArrays):
         if self.rate is None:
             return None
         change = as_setting(self.rate)
-        if (
-            change is None
-            or change.shape not in ((), half.shape)
-            or not ((change >= SMALLEST_NUMBER) & (change < LARGEST_NUMBER)).all()
-        ):
-            raise ValueError(f"rate must be a positive number or shape {half.shape}, got {shown(self.rate)}")
-        if (change >= 2.0 * half).all():
-            raise ValueError(f"rate = {shown(self.rate)} limits nothing: inputs change by no more than their range")
+        fits = change is not None and change.shape in ((), half.shape) and (change >= SMALLEST_NUMBER).all()
+        if change is None or not fits or not (change < 2.0 * half).any() or not np.isfinite(change).all():
+            raise ValueError(
+                f"rate must be a positive number or shape {half.shape}, smaller than the range of some input, got "
+                f"{shown(self.rate)}"
+            )
         return np.broadcast_to(change, half.shape).copy()
 
     def _pair(self, name: str, model: Model) -> Any:
         """Returns limits of states or inputs as a pair (low, high), also where half-widths are given."""
-        given, size = getattr(self, name), len(getattr(model, name))
+        given = getattr(self, name)
         widths = as_setting(given)
-        if widths is None or widths.shape not in ((), (size,)):
+        if widths is None or widths.shape not in ((), getattr(model, name).shape):
             return given
-        if any(model.is_given):
+        if model.at is not None or not (widths > 0.0).all():
             raise ValueError(
-                f"{name} limits are absolute beside at= of a Model: give a pair (low, high) in place of half-widths, "
-                f"got {shown(given)}"
-            )
-        fits = (widths > SMALLEST_NUMBER) & (widths < LARGEST_NUMBER) | (widths == np.inf)
-        if not fits.all() or not np.isfinite(widths).any():
-            raise ValueError(
-                f"{name} limits must be positive half-widths of shape ({size},), not all infinite, or a pair (low, "
-                f"high) of vectors, got {shown(given)}"
+                f"{name} limits must be positive half-widths, or a pair (low, high) as beside at= of a Model, where "
+                f"they are absolute, got {shown(given)}"
             )
         return -widths, widths
-
-    def _ends(self, name: str, model: Model) -> np.ndarray:
-        is_given = model.is_given[name == "input"]
-        return _from_center(self._pair(name, model), getattr(model, name), f"{name} limits", is_given=is_given)
-
-
-def _chosen(model: Model, inputs: np.ndarray) -> Rows:
-    """Returns half-widths for states without limits: many times what inputs within ends (2, m) reach in n steps.
-
-    Raises:
-        ValueError: If no input moves a state, so that nothing says how large it gets.
-    """
-    reach = reach_in_steps(model.A, model.B, np.abs(inputs).max(axis=0), np.zeros(len(model.A)))
-    if not reach.all():
-        raise ValueError(f"Limits need state=: no input moves state {reach.argmin() + 1}, which none of them limits")
-    widths = np.array([float(exact.rounded(FREE_REACH * each, 1)) for each in reach])
-    text = f"no state has a limit: half-widths {shown(widths.tolist())} were chosen, give Limits(state=...) for others"
-    warn_caller(text, ChosenLimitsWarning)
-    return Rows.of(np.eye(len(widths)), -widths, widths)

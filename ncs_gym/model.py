@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -73,10 +74,7 @@ class Model(ReadOnlyArrays):
             equilibrium.
         continuous: [Ac, Bc] of x' = Ac x + Bc u that A and B were sampled from, shape (n, n + m); None if unknown.
         delays: Steps after which an input takes effect (`with_delays`).
-        state, input: `at`, with zeros for what is not given.
-        is_given: Which of the two is.
-        lacking: What `at` lacks of an equilibrium by rounding, shape (n,).
-        step_offset: Sizes of the constant that `at` rests under, shape (n,).
+        state, input: `at`, zero where it is None.
 
     Raises:
         ValueError: If a matrix has a wrong shape or is not finite, or `at` is no equilibrium.
@@ -92,9 +90,6 @@ class Model(ReadOnlyArrays):
     delays: int = 0
     state: np.ndarray = field(init=False, repr=False)
     input: np.ndarray = field(init=False, repr=False)
-    is_given: tuple[bool, bool] = field(init=False, repr=False)
-    lacking: np.ndarray = field(init=False, repr=False)
-    step_offset: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         A = _square(self.A)
@@ -103,23 +98,36 @@ class Model(ReadOnlyArrays):
         H = np.eye(n) if self.H is None else as_matrix(self.H, (None, n), "H")
         if (np.abs(H).max(axis=1) < SMALLEST_NUMBER).any():
             raise ValueError(f"every row of H must measure something, got {shown(H.tolist())}")
-        m, at = B.shape[1], (None, None) if self.at is None else self.at
+        at = (None, None) if self.at is None else self.at
         if not isinstance(at, tuple | list) or len(at) != 2:
             raise ValueError(f"at must be a pair of a state and an input, got {shown(at)}")
-        named = zip(("state", "input"), at, (n, m), strict=True)
+        named = zip(("state", "input"), at, B.shape, strict=True)
         x, u = (
             np.zeros(size) if of is None else as_point(of, size, f"the {name} in at=(state, input)")
             for name, of, size in named
         )
         dt = as_number(self.dt, "dt", low=0.0, low_open=True)
         self._set(at=as_given(self.at), A=A, B=B, H=H, dt=dt, state=x, input=u)
-        self._set(is_given=tuple(each is not None for each in at), lacking=np.zeros(n), step_offset=np.zeros(n))
         if self.offset is not None:
-            c = as_vector(self.offset, n, "offset")
-            self._set(offset=c, lacking=_lacking(A, B, c, x, u), step_offset=np.abs(c))
+            self._set(offset=as_vector(self.offset, n, "offset"))
+        _ = self.lacking  # which refuses a point that is no equilibrium
         if self.continuous is not None:
-            self._set(continuous=as_matrix(self.continuous, (n, n + m), "continuous"))
+            self._set(continuous=as_matrix(self.continuous, (n, n + B.shape[1]), "continuous"))
         self._set(delays=as_count(self.delays, "delays", low=0, high=LONGEST_INPUT_DELAY))
+
+    @cached_property
+    def lacking(self) -> np.ndarray:
+        """What `at` lacks of an equilibrium beside an offset, shape (n,); raises ValueError if it is not rounding."""
+        n, c = len(self.A), self.offset
+        if c is None:
+            return np.zeros(n)
+        missing, rests = residual(self.A, self.B, np.eye(n), self.state, self.input, c)
+        if not rests:
+            raise ValueError(
+                f"the operating point is no equilibrium: A x0 + B u0 + c - x0 = {shown(missing.tolist())}, not zero; "
+                "leave out offset, which is c of a step, if the model is one of deviations from the operating point"
+            )
+        return missing
 
     @classmethod
     def sampled(cls, A: Any, B: Any, C: Any, dt: float, at: Any = None) -> Self:
@@ -143,20 +151,32 @@ class Model(ReadOnlyArrays):
         Raises:
             ValueError: If it is no such model, D is not zero, or dt is missing or another than the model's.
         """
-        A, B, C, D, own = _matrices_of(system)
-        given = as_numbers(0.0 if D is None else D)
-        if given is None or given.any():
+        given = (
+            system if isinstance(system, tuple | list) else [getattr(system, name, None) for name in (*"ABCD", "dt")]
+        )
+        A, B, C, D, own = (*given, 0)[:5] if len(given) in (4, 5) else 5 * (None,)
+        if A is None or B is None or C is None:
+            raise ValueError(
+                "the system must be a state-space model of python-control (control.ss(...)) or scipy.signal, whose "
+                f"states limits and names are of, or a tuple (A, B, C, D) or (A, B, C, D, dt), got {shown(system)}"
+            )
+        feedthrough = as_numbers(0.0 if D is None else D)
+        if feedthrough is None or feedthrough.any():
             raise ValueError(
                 "D of the model must be zero, since sensors here measure y = H x + v: subtract D u, of which u is "
-                f"known, from what is measured and give D = 0, got {shown(D if given is None else given.tolist())}"
+                f"known, from what is measured and give D = 0, got {shown(D)}"
             )
-        is_continuous = own is not True and own == 0
-        if dt is None:
-            if is_continuous or own is True:
-                raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
-            dt = own
-        dt = as_number(dt, "dt", low=0.0, low_open=True)
-        if is_continuous:
+        if own is None and type(system).__module__.startswith("scipy."):
+            own = 0  # of its models in continuous time
+        if own is None:
+            raise ValueError(
+                "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with "
+                "dt=0 or with its sampling time in seconds"
+            )
+        if dt is None and (own is True or own == 0):
+            raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
+        dt = as_number(own if dt is None else dt, "dt", low=0.0, low_open=True)
+        if own is not True and own == 0:
             return cls.sampled(A, B, C, dt, at)
         if own is not True and abs(as_number(own, "dt of the model", low=0.0) - dt) > SAME_STEP * dt:
             raise ValueError(f"dt must be that of the model in discrete time, {own}, or be left out, got {dt}")
@@ -192,47 +212,3 @@ def residual(
     missing = exact.product(np.hstack([A, B, E, -np.eye(len(A))]), np.concatenate([x, u, w, x]))
     terms = np.abs(A) @ np.abs(x) + np.abs(B) @ np.abs(u) + np.abs(E) @ np.abs(w) + np.abs(x)
     return missing, bool((np.abs(missing) <= EQUILIBRIUM_PRECISION * terms).all())
-
-
-def _lacking(A: np.ndarray, B: np.ndarray, offset: np.ndarray, state: np.ndarray, applied: np.ndarray) -> np.ndarray:
-    """Returns A x0 + B u0 + c - x0, shape (n,); raises ValueError if it is more than rounding."""
-    eye = np.eye(len(A))
-    missing, rests = residual(A, B, eye, state, applied, offset)
-    if rests:
-        return missing
-    remedy = "leave out offset, which is c of a step, if the model is one of deviations from the operating point"
-    if exact.rank(rest := eye - A) == len(A):
-        equilibrium = exact.product(exact.inverse(rest), B @ applied + offset).tolist()
-        remedy = f"with this input the equilibrium is {shown(equilibrium)}, or {remedy}"
-    raise ValueError(
-        f"the operating point is no equilibrium: A x0 + B u0 + c - x0 = {shown(missing.tolist())}, not zero; {remedy}"
-    )
-
-
-def _matrices_of(system: Any) -> tuple[Any, Any, Any, Any, Any]:
-    """Returns A, B, C, D and the sampling time of a model: 0 in continuous time, True if it is unknown."""
-    if isinstance(system, (tuple, list)) and len(system) in (4, 5):
-        *matrices, own = (*system, 0)[:5]
-    elif not hasattr(system, "A") and (hasattr(system, "to_ss") or hasattr(system, "num")):
-        raise ValueError(
-            f"{shown(system)} is a transfer function, whose states would be nobody's: limits and names are of states, "
-            "so give a state-space model with states of yours"
-        )
-    elif not all(hasattr(system, name) for name in "ABCD"):
-        raise ValueError(
-            "the system must be a state-space model of python-control (control.ss(...)) or scipy.signal, or a tuple "
-            f"(A, B, C, D) or (A, B, C, D, dt), got {shown(system)}"
-        )
-    else:
-        *matrices, own = (getattr(system, name, None) for name in ("A", "B", "C", "D", "dt"))
-    if own is None:
-        from scipy.signal import lti  # takes long to import, and is there if the model is scipy's
-
-        if not isinstance(system, lti):
-            raise ValueError(
-                "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with "
-                "dt=0 or with its sampling time in seconds"
-            )
-        own = 0
-    A, B, C, D = matrices
-    return A, B, C, D, own

@@ -151,7 +151,7 @@ class Factory:
 
     def _disturbance(self, plant: Any) -> Any:
         own = self.disturbance
-        if not isinstance(plant, LinearPlant) or own.check(plant) or own.excess(plant):
+        if not isinstance(plant, LinearPlant) or own.check(plant):
             return "ball"
         return own
 

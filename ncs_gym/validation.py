@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import sys
 import warnings
 from operator import attrgetter
@@ -16,8 +15,6 @@ import numpy as np
 LARGEST_NUMBER, SMALLEST_NUMBER = 1e75, 1e-75
 # Steps and environments are counted in 32 bits.
 LARGEST_COUNT = 2**31 - 1
-# A sparse matrix with more entries, zeros included, is not expanded.
-MOST_EXPANDED = 10_000_000
 # Messages quote no more of a value than this many letters, and names and phrases of plants have no more.
 MAX_QUOTED_LENGTH, LONGEST_TEXT = 200, 1000
 # What a covariance may lack of a symmetric, positive semidefinite one, in units of its deviations: a few roundings of
@@ -175,7 +172,7 @@ def as_numbers(value: Any) -> np.ndarray | None:
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
-        array = _as_array(value)
+        array = np.asarray(value)
         if isinstance(value, np.ma.MaskedArray) or array.dtype.kind not in "fiub":
             return None
         with np.errstate(all="ignore"):
@@ -202,67 +199,36 @@ def reason_of(error: BaseException) -> str:
 def as_setting(value: Any) -> np.ndarray | None:
     """Returns a new float64 array; None for what is not real numbers: text, truth values, complex or masked ones."""
     numbers = as_numbers(value)
-    return None if numbers is None or _as_array(value).dtype.kind == "b" else np.array(numbers)
+    return None if numbers is None or np.asarray(value).dtype.kind == "b" else np.array(numbers)
 
 
-def _as_array(value: Any) -> np.ndarray:
-    """Returns an array, also of a sparse matrix of scipy, which numpy takes for an object, unless it is too large."""
-    array = np.asarray(value)
-    if array.dtype.kind == "O" and array.ndim == 0 and _is_sparse(value):
-        return value.toarray() if math.prod(value.shape) <= MOST_EXPANDED else array
-    return array
-
-
-def _is_sparse(value: Any) -> bool:
-    """Returns whether a value is a sparse matrix of scipy."""
-    return hasattr(value, "toarray") and hasattr(value, "nnz")
-
-
-def as_matrix(value: Any, shape: tuple[int | None, int | None], name: str) -> np.ndarray:
-    """Returns `value` as a finite float64 matrix of the expected shape.
+def as_matrix(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
+    """Returns `value` as a finite float64 matrix, or a vector, of the expected shape.
 
     Args:
-        value: Anything numpy can turn into a two-dimensional array.
-        shape: Expected (rows, columns); None accepts any positive number.
+        value: Anything numpy can turn into an array.
+        shape: Expected (rows, columns), or (entries,); None accepts any positive number.
         name: What the error message calls it.
 
     Raises:
         ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
     """
-    matrix = as_setting(value)
-    if matrix is None and _is_sparse(value) and math.prod(value.shape) > MOST_EXPANDED:
-        sizes = " x ".join(map(str, value.shape))
-        raise ValueError(
-            f"{name} is a sparse matrix of {sizes} entries, which is not expanded beyond {MOST_EXPANDED:,} of them: "
-            "reduce the model"
-        )
-    if matrix is None:
-        raise ValueError(f"{name} must be a matrix of numbers, got {shown(value)}")
-    expected = "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
-    fits = matrix.ndim == 2 and all(
-        have > 0 and (want is None or have == want) for have, want in zip(matrix.shape, shape, strict=True)
-    )
-    if not fits:
-        raise ValueError(f"{name} must have shape {expected}, got {matrix.shape}")
-    if not (np.abs(matrix) < LARGEST_NUMBER).all():
-        raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(matrix.tolist())}")
-    return matrix
+    array, kind = as_setting(value), "vector" if len(shape) == 1 else "matrix"
+    if array is None:
+        raise ValueError(f"{name} must be a {kind} of numbers, got {shown(value)}")
+    expected = str(tuple("any" if size is None else size for size in shape)).replace("'", "")
+    if array.ndim != len(shape) or not all(
+        have > 0 and want in (None, have) for have, want in zip(array.shape, shape, strict=True)
+    ):
+        raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+    if not (np.abs(array) < LARGEST_NUMBER).all():
+        raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(array.tolist())}")
+    return array
 
 
 def as_vector(value: Any, size: int | None, name: str) -> np.ndarray:
-    """Returns `value` as a finite float64 vector of the expected size (None: any).
-
-    Raises:
-        ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
-    """
-    vector = as_setting(value)
-    if vector is None:
-        raise ValueError(f"{name} must be a vector of numbers, got {shown(value)}")
-    if vector.ndim != 1 or vector.size == 0 or size not in (None, vector.size):
-        raise ValueError(f"{name} must have shape ({'any' if size is None else size},), got {vector.shape}")
-    if not (np.abs(vector) < LARGEST_NUMBER).all():
-        raise ValueError(f"{name} must be finite and below {LARGEST_NUMBER:g} in size, got {shown(vector.tolist())}")
-    return vector
+    """Returns `value` as a finite float64 vector of the expected size (None: any); for errors see `as_matrix`."""
+    return as_matrix(value, (size,), name)
 
 
 def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
@@ -338,11 +304,6 @@ def as_names(value: Any, default: tuple[str, ...], name: str) -> tuple[str, ...]
     if value and len(value) != len(default):
         raise ValueError(f"{name} must have {len(default)} entries, got {shown(value)}")
     return tuple(value) or default
-
-
-def as_units(value: Any, count: int, name: str) -> tuple[str, ...]:
-    """Returns units, as texts; "" for those without, as the unit "1" stands for. For errors see `as_names`."""
-    return tuple("" if unit == "1" else unit for unit in as_names(value, ("",) * count, name))
 
 
 def require_short_text(text: str, name: str) -> None:

@@ -139,8 +139,8 @@ class _Fallbacks:
         at_samples = np.hstack([within.at_samples, np.zeros((k, m))])
         inputs = np.hstack([np.zeros((m, n)), np.eye(m)])
         rows = np.concatenate([at_samples, np.hstack([within.state, within.input]), inputs])
-        low = np.concatenate([within.low_at_samples, within.low, plant.input_low])
-        high = np.concatenate([within.high_at_samples, within.high, plant.input_high])
+        low = np.concatenate([within.low_at_samples, within.low, plant.input_ends[0]])
+        high = np.concatenate([within.high_at_samples, within.high, plant.input_ends[1]])
         resting = rows @ np.concatenate([rest.resting_state, rest.resting_input])
         disturbed = np.concatenate([np.zeros(k), within.disturbed, np.zeros(m)])
         # Where the box counts at samples alone, it is known to hold S.

@@ -102,7 +102,7 @@ def _limits(plant: LinearPlant | None, model: Model, described: dict[str, Any]) 
     if plant is not None and plant.limits.rate is not None and "mixed_ends" in given:
         given |= _without_rates(plant, given)
     own = Limits(input=1.0) if plant is None else plant.limits
-    if any(model.is_given) and plant is not None:
+    if model.at is not None and plant is not None:
         own = _around(own, model)
     point = np.concatenate([model.state, model.input])
     of_states = [each for each in own.rows if each[1] is None]
@@ -124,7 +124,7 @@ def _limits(plant: LinearPlant | None, model: Model, described: dict[str, Any]) 
         elif "box_ends" in given and given["box_ends"] is not None:
             state, of_states = (model.state + ends[0] * box, model.state + ends[1] * box), []
         else:
-            state, of_states = (model.state - box, model.state + box) if any(model.is_given) else box, []
+            state, of_states = (model.state - box, model.state + box) if model.at is not None else box, []
     elif given.get("box_ends") is not None and plant is not None:
         rows = zip(plant.box, np.asarray(given["box_ends"]).T, strict=True)
         state, of_states = None, [(row, None, *(end + row @ model.state)) for row, end in rows]
@@ -140,7 +140,7 @@ def _limits(plant: LinearPlant | None, model: Model, described: dict[str, Any]) 
     inputs = own.input
     if given.get("u_max") is not None:
         widths = np.asarray(given["u_max"], dtype=float)
-        inputs = (model.input - widths, model.input + widths) if any(model.is_given) else widths
+        inputs = (model.input - widths, model.input + widths) if model.at is not None else widths
     if given.get("input_limits") is not None:
         inputs = _pair(given["input_limits"], len(model.input))
     if given.get("input_ends") is not None:

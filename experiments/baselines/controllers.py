@@ -186,7 +186,7 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     to_go = np.real(sqrtm(solve_discrete_are(A, B, E.T @ E, D.T @ D, s=E.T @ D)))
     beyond, grid = ((0, 0), (0, len(A) - plant.n)), rows_within_step(plant)
     rows, between = np.pad(plant.box, beyond), np.pad(grid.state, beyond)
-    low, high = closed(np.concatenate([grid.low, plant.box_low]), np.concatenate([grid.high, plant.box_high]))
+    low, high = closed(np.concatenate([grid.low, plant.box_ends[0]]), np.concatenate([grid.high, plant.box_ends[1]]))
     low, high = np.tile(low + margin, steps), np.tile(high - margin, steps)
     every_row = np.block([[between, grid.input], [rows, np.zeros((len(rows), m))]])
     least, most = (np.tile(ends, steps) for ends in plant.input_ends)

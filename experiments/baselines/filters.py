@@ -110,7 +110,7 @@ class PredictiveFilter:
         self._ends_in_ellipsoid = polytope is None
         self._prediction = Prediction(certificate_test(certificate, plant), horizon)
         self._program = PlanProgram(self._prediction)
-        self._middle, half = _middle_and_half(plant.box_low, plant.box_high)
+        self._middle, half = _middle_and_half(*plant.box_ends)
         at_samples = np.tile(half - margin, (horizon + 1, 1))
         self._end_middle, end_half, to_face = np.zeros(1), np.ones(1), np.ones(1)
         if polytope is not None:
@@ -181,7 +181,7 @@ class PredictiveFilter:
         plan = self._program.solve(estimate, self._all_limits, self._weighting, radius, self._between, proposed)
         if plan is None:
             return None
-        plan = np.clip(plan, plant.input_low, plant.input_high)
+        plan = np.clip(plan, *plant.input_ends)
         centers = self._prediction.centers(estimate[None], plan[None, None])[..., 0, 0]
         inside = (np.abs(centers[:-1] @ plant.box.T - self._middle) <= self._limits + TOLERANCE).all()
         begun = np.vstack([estimate, centers[:-1]])
@@ -201,7 +201,7 @@ class PredictiveFilter:
     def _gained(self, states: np.ndarray) -> np.ndarray:
         """Returns the fallback within the limits, shape (m,) or (N, m)."""
         inputs = states @ self._fallback.gain.T + self._fallback.constant
-        return np.clip(inputs, self._plant.input_low, self._plant.input_high)
+        return np.clip(inputs, *self._plant.input_ends)
 
 
 def _middle_and_half(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -61,7 +61,7 @@ def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid
         ValueError: If it is none, or of another dimension than the plant.
     """
     if initial_set is None:
-        box = plant.box / np.minimum(-plant.box_low, plant.box_high)[:, None]
+        box = plant.box / np.abs(plant.box_ends).min(axis=0)[:, None]
         is_bounded, widths = exact.rank(box) == plant.n, plant.half_widths
         gram = (box * widths).T @ (box * widths)
         shape = START_FRACTION**2 * (

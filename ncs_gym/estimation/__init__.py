@@ -8,13 +8,12 @@
 
 from ncs_gym.estimation.error_bound import ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.estimation.estimator import Estimate, Estimator
+from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 
 __all__ = [
     "ErrorSet",
     "ErrorSetError",
-    "Estimate",
     "Estimator",
     "UnstablePlantError",
     "VectorEstimator",

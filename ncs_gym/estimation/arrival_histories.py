@@ -36,7 +36,7 @@ MAX_GRAPHS = 32
 # The arrays of a graph, whose last axis is the history.
 _BY_HISTORY = (
     *("present", "replay_from", "target", "new_age", "accepted", "arrival", "used"),
-    *("_priors", "_held", "_recurs", "next"),
+    *("_priors", "_held", "next"),
 )
 
 
@@ -51,14 +51,10 @@ class ArrivalHistories:
     Args:
         recursion: Moves the error statistics.
         channel: Gives the length of the replay buffer.
-        table: Error statistics to begin with; none by default.
-        coarsens: Whether shapes are rounded more coarsely from each time on that histories are forgotten: bounds are
-            still bounds, but how large they are depends on what was met before.
 
     Attributes:
         recursion: The same.
         channel: The same.
-        coarsens: The same.
         buffer: Age of the oldest sample that is of use [steps].
         root: Number of the history at the start of an episode.
         table: The distinct error statistics met so far.
@@ -73,14 +69,12 @@ class ArrivalHistories:
         used: Statistics before the update at each age, NO_SAMPLE without one, shape (buffer + 1, capacity).
     """
 
-    def __init__(
-        self, recursion: ErrorRecursion, channel: Channel, table: ErrorTable | None = None, coarsens: bool = False
-    ) -> None:
-        self.recursion, self.channel, self.coarsens = recursion, channel, coarsens
+    def __init__(self, recursion: ErrorRecursion, channel: Channel) -> None:
+        self.recursion, self.channel = recursion, channel
         self.buffer, size = channel.longest_delay, FIRST_CAPACITY
         # Ages above this make no difference: neither to a certified set nor to what the buffer holds.
         oldest = max(self.buffer + 1, recursion.error_set.oldest + 1)
-        self.table = ErrorTable(recursion, oldest) if table is None else table
+        self.table = ErrorTable(recursion, oldest)
         held_ages = self.buffer + 1
         self._key = f"{held_ages + 2}q{held_ages}?"
         self._count = 0
@@ -89,7 +83,6 @@ class ArrivalHistories:
         self.present, self.replay_from, self.next, self.target, self.new_age = np.zeros((5, size), np.int64)
         self.arrival, self.used, self._priors = np.zeros((3, held_ages, size), np.int64)
         self._held, self.accepted = np.zeros((held_ages, size), np.bool_), np.zeros(size, np.bool_)
-        self._recurs = np.zeros(size, np.bool_)  # whether a step led here more than once
         self._ahead: dict[int, np.ndarray] = {}  # by number of steps, then by number of the statistics
         self._lock = threading.RLock()
         # Weak, or an estimator that never moves on from this graph would keep all that came after it.
@@ -120,8 +113,6 @@ class ArrivalHistories:
                 predicted = self.table.after_step(present)
                 after = self._number_of(predicted, (predicted, *priors[:-1]), (False, *held[:-1]), NO_REPLAY)
                 self.next[history] = after
-        else:
-            self._recurs[after] = True
         return after
 
     def after_arrival(self, history: int, age: int) -> int:
@@ -189,19 +180,11 @@ class ArrivalHistories:
         return False
 
     def keeping(self, histories: np.ndarray) -> tuple[ArrivalHistories, np.ndarray]:
-        """Returns a graph with some histories, shape (k,), only, and their numbers there.
-
-        Error statistics that recurred are kept as well, since they take the longest to work out, unless they are
-        rounded more coarsely from now on.
-        """
+        """Returns a graph with some histories, shape (k,), only, and their numbers there."""
         with self._lock:
             successor = None if self._successor is None else self._successor()
             if successor is None or successor.is_full:
-                recursion, table = self.recursion.coarser() if self.coarsens else self.recursion, None
-                if recursion is self.recursion:
-                    self.table.mark(self.present[: self._count][self._recurs[: self._count]])
-                    table = self.table.recurring(MAX_BYTES // (4 * self.table.bytes_each))
-                successor = ArrivalHistories(recursion, self.channel, table, self.coarsens)
+                successor = ArrivalHistories(self.recursion, self.channel)
                 self._successor = weakref.ref(successor)
             with _shared_lock:
                 for key, shared in _shared.items():
@@ -242,7 +225,7 @@ class ArrivalHistories:
             self._priors[:, number], self._held[:, number] = priors, held
             self.next[number] = self.arrival[:, number] = self.new_age[number] = UNKNOWN
             self.target[number] = number if replay_from == NO_REPLAY else UNKNOWN
-            self.accepted[number], self._recurs[number], self.used[:, number] = False, False, NO_SAMPLE
+            self.accepted[number], self.used[:, number] = False, NO_SAMPLE
             self._count = number + 1
             self._numbers[key] = number  # last: if this is interrupted, the history has not occurred
             size = self._count * self._bytes_each + len(self.table) * self.table.bytes_each
@@ -272,17 +255,12 @@ class ArrivalHistories:
         return target
 
 
-_shared: dict[tuple[str, Channel, ChannelContract | None, bool], ArrivalHistories] = {}
+_shared: dict[tuple[str, Channel, ChannelContract | None], ArrivalHistories] = {}
 _shared_lock = threading.Lock()
 
 
-def arrival_histories(
-    plant: LinearPlant, channel: Channel, contract: ChannelContract | None, coarsens: bool = False
-) -> ArrivalHistories:
+def arrival_histories(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ArrivalHistories:
     """Returns the graph that all estimators of a plant behind a channel share in this process.
-
-    Simulations share one that does not coarsen, so that they say the same whatever ran before; loops in real time one
-    that does, so that each step soon is a look-up.
 
     Raises:
         UnstablePlantError: If the plant is not Schur stable and there is no contract.
@@ -290,10 +268,10 @@ def arrival_histories(
     """
     # Only delays and quantization matter to it, not how packets are lost or when they are sent.
     kept = Channel(quantization_step=channel.quantization_step, delay=channel.delay, jitter=channel.jitter)
-    key = plant.fingerprint, kept, contract, coarsens
+    key = plant.fingerprint, kept, contract
     histories = _shared.get(key)
     if histories is None:
-        histories = histories_of(plant, kept, certified_error_set(plant, contract), coarsens)
+        histories = histories_of(plant, kept, certified_error_set(plant, contract))
     with _shared_lock:
         histories = _shared[key] = _shared.pop(key, histories)
         if len(_shared) > MAX_GRAPHS:  # the one that was asked for the longest ago
@@ -301,9 +279,7 @@ def arrival_histories(
     return histories
 
 
-def histories_of(
-    plant: LinearPlant, channel: Channel, error_set: ErrorSet, coarsens: bool = False, **precision: Any
-) -> ArrivalHistories:
+def histories_of(plant: LinearPlant, channel: Channel, error_set: ErrorSet, **precision: Any) -> ArrivalHistories:
     """Returns a graph of its own; see `ErrorRecursion` for the precision of covariances and shapes."""
     recursion = ErrorRecursion(plant, channel.quantization_step, error_set, **precision)
-    return ArrivalHistories(recursion, channel, coarsens=coarsens)
+    return ArrivalHistories(recursion, channel)

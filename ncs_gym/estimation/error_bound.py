@@ -11,9 +11,8 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age, in_round_numbers
-from ncs_gym.estimation.error_sets import ErrorSet, ErrorSetError, InvariantErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet, ErrorSetError
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.description import outputs_of
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import rounded_up
 
@@ -56,21 +55,17 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     """Returns the error sets by age under a contract; see `error_sets_by_age`."""
     try:
         sets = error_sets_by_age(plant, contract)
-    except ErrorSetError:
-        raise ErrorSetError(_why_no_set(plant, contract)) from None
+    except ErrorSetError as error:
+        if (unseen := unseen_state(plant.A, plant.H, plant.half_widths, plant.state_names)) is not None:
+            raise ErrorSetError(
+                f"no error set exists: the outputs do not show {unseen}, whose errors never decay"
+            ) from None
+        raise ErrorSetError(
+            f"no error set was found under a contract of max_age = {contract.max_age}: promise less age, or give finer "
+            f"sensors, since {error}"
+        ) from None
     require_error_set(sets, plant)
     return _round_if_it_holds(in_round_numbers(sets), sets, plant)
-
-
-def _why_no_set(plant: LinearPlant, contract: ChannelContract) -> str:
-    """Returns what an error says of a plant for which no sets are found under a contract."""
-    if (unseen := unseen_state(plant.A, plant.H, plant.half_widths, plant.state_names)) is not None:
-        return f"no error set exists: the outputs do not show {unseen}, whose errors never decay"
-    try:
-        error_sets_by_age(plant, replace(contract, max_age=0))
-    except ErrorSetError as none:
-        return f"no error set was found, not even for samples of age 0: {_loudest_sensor(plant) or none}"
-    return f"no error set was found under a contract of max_age = {contract.max_age}: promise less age"
 
 
 def _round_if_it_holds(rounded: ErrorSet, other: ErrorSet, plant: LinearPlant) -> ErrorSet:
@@ -101,16 +96,6 @@ def unseen_state(A: np.ndarray, H: np.ndarray, widths: np.ndarray, names: Sequen
             if shown[-1] <= UNDETECTABLE * shown[0]:
                 return names[int(np.argmax(np.abs(directions[-1])))]
     return None
-
-
-def _loudest_sensor(plant: LinearPlant) -> str:
-    """Returns which output is drowned in noise, as a sentence; an empty string if none is."""
-    reach = np.abs(plant.H) @ plant.half_widths
-    times = np.sqrt(np.diag(plant.sensor_error.shape_matrix)) / np.maximum(reach, np.finfo(float).tiny)
-    j, (names, _) = int(np.argmax(times)), outputs_of(plant)
-    if times[j] < 1.0:
-        return ""
-    return f"the sensor noise of {names[j]} is {times[j]:.3g} times as large as {names[j]} gets in the safe box"
 
 
 def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
@@ -184,9 +169,9 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     best: Any = minimize_scalar(size, bounds=bounds, method="bounded", options=options)
     rate = 1.0 - float(exact.rounded(1.0 - best.x, RATE_DIGITS))
     Sigma = T @ (GROWTH * _smallest_solution(A, D, first, rate)) @ T.T
-    found = InvariantErrorSet(Sigma=0.5 * (Sigma + Sigma.T), rate=rate)
+    found = ErrorSet(shapes=0.5 * (Sigma + Sigma.T)[None], rates=np.array([rate]))
     require_error_set(found, plant)
-    return _round_if_it_holds(replace(found, Sigma=rounded_up(found.Sigma, DIGITS)), found, plant)
+    return _round_if_it_holds(replace(found, shapes=rounded_up(found.Sigma, DIGITS)[None]), found, plant)
 
 
 def _smallest_solution(A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.estimation.error_sets import ErrorSetError, ErrorSetsByAge, congruence_sum
+from ncs_gym.estimation.error_sets import ErrorSet, ErrorSetError, congruence_sum
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
@@ -37,7 +37,7 @@ REGULATOR_DIGITS = 6
 LARGEST = 1e6
 
 
-def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge:
+def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     """Returns error sets by age, without a solver.
 
     Raises:
@@ -50,7 +50,7 @@ def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSet
             raise ErrorSetError("the numbers of the sets are out of reach of float64") from None
 
 
-def in_round_numbers(sets: ErrorSetsByAge) -> ErrorSetsByAge:
+def in_round_numbers(sets: ErrorSet) -> ErrorSet:
     """Returns the sets, a little larger, in numbers that hardly depend on the processor; they are to be checked."""
     units = 10.0 ** np.floor(0.5 * np.log10(np.maximum(np.diag(sets.noise), 1e-300)))  # of the outputs
     return replace(
@@ -61,7 +61,7 @@ def in_round_numbers(sets: ErrorSetsByAge) -> ErrorSetsByAge:
     )
 
 
-def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsByAge:
+def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     """Returns error sets by age.
 
     From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
@@ -101,7 +101,7 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSetsBy
         raise ErrorSetError(f"the sets did not settle in {ITERATIONS} rounds")
     shapes = _carried(start, A, D, steps)
     gains, multipliers, _ = zip(*(_update(shape, H, noise) for shape in shapes[1:]), strict=True)
-    return ErrorSetsByAge(
+    return ErrorSet(
         contract=contract,
         shapes=np.stack([_symmetric(T @ shape @ T.T) for shape in shapes]),
         rates=np.array([_rate(shape, A, D) for shape in shapes[:-1]]),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import Literal, Self, overload
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -23,136 +21,16 @@ class ErrorSetError(ValueError):
 Need = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-class ErrorSet(ReadOnlyArrays, ABC):
-    """The ellipsoids that the estimation error never leaves, by the age of the newest sample.
-
-    Attributes:
-        contract: The promise of the channel that they rest on; None for none.
-        Sigma: Shape of the set of the largest age promised, (n, n) [squares of the units of the state].
-        rate: The rate of the largest age promised, in (0, 1).
-        shapes: Of all of them, shape (s, n, n).
-        promised: Of the ages that are promised, shape (k, n, n): whatever an input is decided from lies in one of them.
-        rates: lam of each of these, shape (k,): it carries the set of one age into that of the next.
-        gains: Those that lead from every age above 0 back into the set of age 0, shape (s - 1, n, p).
-    """
-
-    contract: ChannelContract | None
-    Sigma: np.ndarray
-    rate: float
-    shapes: np.ndarray
-    promised: np.ndarray
-    rates: np.ndarray
-    gains: np.ndarray
-
-    @property
-    def oldest(self) -> int:
-        """Age of the last set: no older sample makes a difference."""
-        return len(self.shapes) - 1
-
-    @overload
-    def shape_at(self, age: Literal[0]) -> np.ndarray: ...
-
-    @overload
-    def shape_at(self, age: int) -> np.ndarray | None: ...
-
-    @abstractmethod
-    def shape_at(self, age: int) -> np.ndarray | None:
-        """Returns the certified shape, (n, n), for a newest sample `age` steps old; None beyond the contract."""
-
-    @abstractmethod
-    def rate_at(self, age: int) -> float:
-        """Returns the rate that carries the set of one age into that of the next."""
-
-    @abstractmethod
-    def remains_certified(self, certified: bool, age: int, predicted: np.ndarray) -> bool:
-        """Returns whether an error is in the set of its age, and stays in those that follow, a step later.
-
-        Args:
-            certified: Whether it was.
-            age: Of the newest sample before the step.
-            predicted: Shape of the ellipsoid that holds the error after it, (n, n).
-        """
-
-    @abstractmethod
-    def larger(self, factor: float) -> Self:
-        """Returns them with every shape larger by a factor of at least 1; their conditions keep holding."""
-
-    @abstractmethod
-    def needs(self, plant: LinearPlant) -> dict[str, list[Need]]:
-        """Returns what has to hold, by the name of the condition."""
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
-class InvariantErrorSet(ErrorSet):
-    """One set for every age, of a stable plant: no packet has to arrive.
+class ErrorSet(ReadOnlyArrays):
+    """The ellipsoids E(Sigma_j) that the estimation error never leaves, by the age j of the newest sample.
+
+    Of a stable plant without a contract that is one set for every age, and no packet has to arrive:
 
         (E0) Sigma >= r0^2 I
-        (E1) Sigma >= A Sigma A'/rate + D/(1 - rate)
+        (E1) Sigma >= A Sigma A'/lam + D/(1 - lam)
 
-    Attributes:
-        Sigma: Shape (n, n) [squares of the units of the state].
-        rate: lam_e in (0, 1).
-    """
-
-    Sigma: np.ndarray
-    rate: float
-
-    def __post_init__(self) -> None:
-        self._make_arrays_read_only()
-
-    @property
-    def contract(self) -> None:
-        """None: nothing is promised."""
-
-    @property
-    def shapes(self) -> np.ndarray:
-        """Sigma, shape (1, n, n)."""
-        return self.Sigma[None]
-
-    @property
-    def promised(self) -> np.ndarray:
-        """Sigma, shape (1, n, n)."""
-        return self.shapes
-
-    @property
-    def rates(self) -> np.ndarray:
-        """lam_e, shape (1,)."""
-        return np.array([self.rate])
-
-    @property
-    def gains(self) -> np.ndarray:
-        """None: an update that would lead out of the set is left out."""
-        return np.empty((0, 0, 0))
-
-    def shape_at(self, age: int) -> np.ndarray:
-        """Returns Sigma."""
-        return self.Sigma
-
-    def rate_at(self, age: int) -> float:
-        """Returns lam_e."""
-        return self.rate
-
-    def remains_certified(self, certified: bool, age: int, predicted: np.ndarray) -> bool:
-        """Returns whether it lies inside, where it stays, by (E1)."""
-        return certified or is_inside(predicted, self.Sigma)
-
-    def larger(self, factor: float) -> Self:
-        """Returns it with a larger Sigma."""
-        return replace(self, Sigma=factor * self.Sigma)
-
-    def needs(self, plant: LinearPlant) -> dict[str, list[Need]]:
-        """Returns what (E0) and (E1) ask for."""
-        identity, Sigma, rate = np.eye(plant.n), self.Sigma, self.rate
-        first = congruence_sum((identity, plant.initial_error.shape_matrix, 1.0))
-        grown = congruence_sum(
-            (plant.A, Sigma, 1.0 / rate), (identity, plant.disturbance.shape_matrix, 1.0 / (1.0 - rate))
-        )
-        return {"(E0)": [(Sigma, *first)], "(E1)": [(Sigma, *grown)]}
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ErrorSetsByAge(ErrorSet):
-    """E(Sigma_0) .. E(Sigma_{h+1}), h the contract's largest age (docs/shield_proof.md, "Channel contracts").
+    Under a contract with the largest age h they are h + 2 (docs/shield_proof.md, "Channel contracts"):
 
         (C0) Sigma_0 >= r0^2 I
         (C1) Sigma_{j+1} >= A Sigma_j A'/lam_j + D/(1-lam_j)                             j = 0..h
@@ -161,57 +39,75 @@ class ErrorSetsByAge(ErrorSet):
     (C2) holds with room for the rounding of an estimate that is updated (docs/shield_proof.md, "Rounding").
 
     Attributes:
-        contract: The promise they rest on.
-        shapes: Sigma_j, shape (h+2, n, n).
-        rates: lam_j, shape (h+1,).
-        gains: T_1 .. T_{h+1}, shape (h+1, n, p).
-        multipliers: mu_1 .. mu_{h+1}, shape (h+1,).
+        shapes: Sigma_j, shape (h + 2, n, n), or (1, n, n) without a contract [squares of the units of the state].
+        rates: lam_j in (0, 1), shape (h + 1,), or (1,): they carry the set of one age into that of the next.
+        contract: The promise of the channel that they rest on; None for none.
+        gains: T_1 .. T_{h+1} under a contract, shape (h + 1, n, p). Without one, an update that would lead out of the
+            set is left out.
+        multipliers: mu_1 .. mu_{h+1}, shape (h + 1,).
         noise: N of the contract's quantizer, shape (p, p).
     """
 
-    contract: ChannelContract
     shapes: np.ndarray
     rates: np.ndarray
-    gains: np.ndarray
-    multipliers: np.ndarray
-    noise: np.ndarray
+    contract: ChannelContract | None = None
+    gains: np.ndarray = field(default_factory=lambda: np.empty((0, 0, 0)))
+    multipliers: np.ndarray = field(default_factory=lambda: np.empty(0))
+    noise: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
 
     def __post_init__(self) -> None:
         self._make_arrays_read_only()
 
     @property
+    def oldest(self) -> int:
+        """Age of the last set: no older sample makes a difference."""
+        return len(self.shapes) - 1
+
+    @property
     def promised(self) -> np.ndarray:
-        """Sigma_0 .. Sigma_h, shape (h+1, n, n)."""
-        return self.shapes[:-1]
+        """Those of promised ages, shape (k, n, n): whatever an input is decided from lies in one of them."""
+        return self.shapes[: len(self.rates)]
 
     @property
     def Sigma(self) -> np.ndarray:
-        """Sigma_h, shape (n, n)."""
-        return self.shapes[-2]
+        """That of the largest age that is promised, shape (n, n)."""
+        return self.promised[-1]
 
     @property
     def rate(self) -> float:
-        """lam_h."""
+        """The rate of the largest age that is promised."""
         return float(self.rates[-1])
 
     def shape_at(self, age: int) -> np.ndarray | None:
-        """Returns Sigma_age, shape (n, n); None beyond Sigma_{h+1}."""
+        """Returns the certified shape, (n, n), for a newest sample `age` steps old; None beyond the contract."""
+        if self.contract is None:
+            return self.shapes[0]
         return self.shapes[age] if age < len(self.shapes) else None
 
     def rate_at(self, age: int) -> float:
-        """Returns lam_age."""
-        return float(self.rates[age])
+        """Returns the rate that carries the set of one age into that of the next."""
+        return float(self.rates[0 if self.contract is None else age])
 
     def remains_certified(self, certified: bool, age: int, predicted: np.ndarray) -> bool:
-        """Returns whether (C1) leads on from the set of its age."""
+        """Returns whether an error is in the set of its age, and stays in those that follow, a step later.
+
+        Without a contract it stays where it is once inside, by (E1); (C1) leads on from the set of its age.
+
+        Args:
+            certified: Whether it was.
+            age: Of the newest sample before the step.
+            predicted: Shape of the ellipsoid that holds the error after it, (n, n).
+        """
+        if self.contract is None:
+            return certified or is_inside(predicted, self.shapes[0])
         return certified and age < self.oldest
 
-    def larger(self, factor: float) -> Self:
-        """Returns them with larger shapes; gains and multipliers stay."""
+    def larger(self, factor: float) -> ErrorSet:
+        """Returns them with every shape larger by a factor of at least 1; their conditions keep holding."""
         return replace(self, shapes=factor * self.shapes)
 
     def needs(self, plant: LinearPlant) -> dict[str, list[Need]]:
-        """Returns what (C0) to (C2) ask for; in (C2) with the rounding of the estimate that is updated with T_j."""
+        """Returns what has to hold, by the name of the condition; (C2) with the rounding of the estimate."""
         D, identity = plant.disturbance.shape_matrix, np.eye(plant.n)
         first = congruence_sum((identity, plant.initial_error.shape_matrix, 1.0))
         grown = [
@@ -227,10 +123,11 @@ class ErrorSetsByAge(ErrorSet):
             )
             for j in range(len(self.gains))
         ]
+        letter = "E" if self.contract is None else "C"
         return {
-            "(C0)": [(self.shapes[0], *first)],
-            "(C1)": [(self.shapes[j + 1], *inner) for j, inner in enumerate(grown)],
-            "(C2)": [(self.shapes[0], *inner) for inner in updated],
+            f"({letter}0)": [(self.shapes[0], *first)],
+            f"({letter}1)": [(self.shapes[min(j + 1, self.oldest)], *inner) for j, inner in enumerate(grown)],
+            f"({letter}2)": [(self.shapes[0], *inner) for inner in updated],
         }
 
     def rounding_of_update(self, plant: LinearPlant, j: int) -> np.ndarray:

@@ -28,7 +28,7 @@ _HASH_SIZE = 16
 _BY_NUMBER_LAST = "gains", "quick_tests"
 _BY_NUMBER = (
     *("_gains", "_by_columns", "_quick_tests", "_covariances", "_shapes"),
-    *("_after_step", "_after_update", "_certified", "_recurs", "_ages"),
+    *("_after_step", "_after_update", "_certified", "_ages"),
 )
 
 
@@ -62,7 +62,6 @@ class ErrorTable:
         self._quick_tests = np.zeros((size, p, p))
         self._covariances, self._shapes = np.zeros((2, size, n, n))
         self._certified = np.zeros(size, np.bool_)
-        self._recurs = np.zeros(size, np.bool_)  # whether statistics were met more than once
         self._after_update[self._add(recursion.first)] = NO_SAMPLE  # which no other statistics are equal to
 
     def __len__(self) -> int:
@@ -75,7 +74,7 @@ class ErrorTable:
     def bytes_each(self) -> int:
         """What the statistics of one number take, about."""
         n, p = self.recursion.plant.n, self.recursion.plant.p
-        return BYTES_PER_KEY + _HASH_SIZE + 8 * (2 * n**2 + 2 * n * p + 2 * p**2 + 3) + 3
+        return BYTES_PER_KEY + _HASH_SIZE + 8 * (2 * n**2 + 2 * n * p + 2 * p**2 + 3) + 2
 
     @property
     def shapes(self) -> np.ndarray:
@@ -113,8 +112,6 @@ class ErrorTable:
         if number is None:
             number = self._add(statistics._replace(age=age))
             self._numbers[key] = number  # last: if this is interrupted, the statistics have not occurred
-        else:
-            self._recurs[number] = True
         return number
 
     def after_step(self, number: int) -> int:
@@ -123,8 +120,6 @@ class ErrorTable:
         if after == UNKNOWN:
             after = self.number_of(self.recursion.predicted(self.statistics(number)))
             self._after_step[number] = after
-        else:
-            self._recurs[after] = True
         return after
 
     def after_update(self, number: int) -> int:
@@ -140,8 +135,6 @@ class ErrorTable:
                 self._by_columns[number] = not gain.flags.c_contiguous
             self.quick_tests[..., number] = self._quick_tests[number] = weight
             self._after_update[number] = after  # last: another thread may look it up, and then wants the rest too
-        else:
-            self._recurs[after] = True
         return after
 
     def update(self, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -152,32 +145,6 @@ class ErrorTable:
         gain, (n, p, _) = self._gains[number], self.gains.shape
         gain = gain.reshape(p, n).T if self._by_columns[number] else gain.reshape(n, p)
         return gain, self._quick_tests[number]
-
-    def mark(self, numbers: np.ndarray) -> None:
-        """Notes that statistics, shape (k,), and what updates make of them recur."""
-        self._recurs[numbers] = True
-        after = self._after_update[numbers]
-        self._recurs[after[after != UNKNOWN]] = True
-
-    def recurring(self, most: int) -> ErrorTable:
-        """Returns a table of the statistics that were met more than once, at most some number of them.
-
-        Those met longest ago come first: what recurs in one table after the other stays.
-        """
-        table = ErrorTable(self.recursion, self.oldest)
-        kept = np.flatnonzero(self._recurs[1 : self._count])[:most] + 1
-        numbers = np.full(self._count + 1, UNKNOWN)  # in the new table; that of UNKNOWN, the last one, is UNKNOWN
-        numbers[NO_SAMPLE], numbers[kept] = NO_SAMPLE, np.arange(1, len(kept) + 1)
-        kept = np.append(NO_SAMPLE, kept)
-        room = np.zeros(FIRST_CAPACITY, np.int64)
-        for name in (*_BY_NUMBER_LAST, *_BY_NUMBER):
-            axis = -1 if name in _BY_NUMBER_LAST else 0
-            setattr(table, name, np.concatenate([getattr(self, name).take(part, axis) for part in (kept, room)], axis))
-        table._after_step, table._after_update = numbers[table._after_step], numbers[table._after_update]
-        table._recurs[:], table._count = False, len(kept)
-        renumbered = numbers.tolist()
-        table._numbers = {key: renumbered[old] for key, old in self._numbers.items() if renumbered[old] != UNKNOWN}
-        return table
 
     def innovation_axes(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns the axes in which residuals before an update of some statistics are tested exactly."""
@@ -198,7 +165,7 @@ class ErrorTable:
                 setattr(self, name, with_room(getattr(self, name), axis=0))
         self._covariances[number], self._shapes[number], self._ages[number], self._certified[number] = statistics
         self._after_step[number] = self._after_update[number] = UNKNOWN
-        self._gains[number], self._by_columns[number], self._recurs[number] = 0.0, False, False
+        self._gains[number], self._by_columns[number] = 0.0, False
         self.gains[..., number] = 0.0
         self._count = number + 1
         return number

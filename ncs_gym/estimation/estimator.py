@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Sequence
 from math import isfinite
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,24 +20,57 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import CopiedWhole, frozen, setting
 
 
-class Estimate(NamedTuple):
-    """What is known about the state at one step.
+class PastSteps(CopiedWhole):
+    """What an estimator keeps of the last steps: of one loop, or of N along the last axis of every array.
+
+    Args:
+        plant: The plant, whose inputs are known exactly.
+        histories: The graph of arrival histories.
+        size: N; None for one loop without that axis.
 
     Attributes:
-        mean: x_hat, shape (n,).
-        covariance: P, shape (n, n), of a Kalman filter that takes the same samples; picks gains and is never used for
-            safety.
-        shape: Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k).
-        newest: Step of the newest sample used (0: the first estimate).
+        plant: The same.
+        histories: The graph in use; another one after histories were forgotten.
+        mean: x_hat, shape (n,) or (n, N), read-only.
+        age: Steps since the newest sample used was taken, an int or shape (N,).
     """
 
     mean: np.ndarray
-    covariance: np.ndarray
-    shape: np.ndarray
-    newest: int
+    age: Any
+
+    def __init__(self, plant: LinearPlant, histories: ArrivalHistories, size: int | None = None) -> None:
+        self.plant, self.histories = plant, histories
+        limit = plant.state_limit if size is None else plant.state_limit[:, None]
+        self._limit = limit if np.isfinite(limit).all() else None
+        self._remember((), (), ())
+
+    def _remember(self, priors: Iterable, inputs: Iterable, samples: Iterable) -> None:
+        """Keeps means before updates, inputs that led there and samples (None where nobody sent), by age."""
+        length = self.histories.buffer + 1
+        self._priors: deque[np.ndarray] = deque(priors, maxlen=length)
+        self._inputs: deque[np.ndarray] = deque(inputs, maxlen=length)
+        self._samples: deque[np.ndarray | None] = deque(samples, maxlen=length)
+
+    @property
+    def table(self) -> ErrorTable:
+        """The error shapes by the numbers that `numbered` returns; another one after shapes were forgotten."""
+        return self.histories.table
+
+    def _predict(self, u: np.ndarray, samples: np.ndarray | None) -> None:
+        """Moves the mean one step on with an input, (m,) or (m, N), before it takes in what arrived."""
+        self.mean = frozen(self._predicted(self.mean, u))
+        self._priors.appendleft(self.mean)
+        self._inputs.appendleft(u)
+        self._samples.appendleft(samples)
+        self.age += 1
+
+    def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Returns A x_hat + B u; an unstable plant's within the limit of its states."""
+        mean = self.plant.A.dot(mean) + self.plant.B.dot(u)
+        return mean if self._limit is None else np.minimum(np.maximum(mean, -self._limit), self._limit)
 
 
-class Estimator(CopiedWhole):
+class Estimator(PastSteps):
     """Estimates the state from time-stamped packets that may be lost, late, reordered or duplicated.
 
     The packets of a step are applied at the steps their samples were taken at, and everything after is replayed. Next
@@ -53,6 +86,7 @@ class Estimator(CopiedWhole):
         after: An estimator whose episodes are counted on.
 
     Attributes:
+        channel, error_set: The same.
         step: Steps since the start of the episode.
         episode: Number of the episode, counted from 0; packets of any other are discarded.
         alarm: Whether a measurement contradicted the assumed bounds in this episode.
@@ -64,10 +98,7 @@ class Estimator(CopiedWhole):
         ValueError: If the channel rounds more coarsely than the contract of the error set allows.
     """
 
-    plant: LinearPlant = setting("plant")
-    channel: Channel = setting("channel")
-    buffer: int = setting("buffer")
-    error_set: ErrorSet = setting("error_set")
+    buffer: int = setting("buffer", "histories.buffer")
 
     def __init__(
         self,
@@ -77,19 +108,15 @@ class Estimator(CopiedWhole):
         histories: ArrivalHistories | None = None,
         after: Estimator | None = None,
     ) -> None:
-        self._plant, self._channel, self._buffer = plant, channel, channel.longest_delay
-        if histories is None:
-            if error_set is None:
-                histories = arrival_histories(plant, channel, None)
-            else:
-                require_error_set(error_set, plant)
-                histories = histories_of(plant, channel, error_set)
-        self._histories = self._usual = histories
-        self._error_set = self._histories.recursion.error_set
-        contract = self._error_set.contract
+        if error_set is not None and histories is None:
+            require_error_set(error_set, plant)
+            histories = histories_of(plant, channel, error_set)
+        histories = arrival_histories(plant, channel, None) if histories is None else histories
+        super().__init__(plant, histories)
+        self._usual, self.channel, self.error_set = histories, channel, histories.recursion.error_set
+        contract = self.error_set.contract
         if contract is not None and not contract.is_fine_enough_for(channel):
             raise ValueError(f"the channel rounds more coarsely than the contract of the error set: {contract}")
-        self._limit = plant.state_limit if np.isfinite(plant.state_limit).all() else None
         self.episode, self._is_new = (0, True) if after is None else (after.episode, after._is_new)
         self._begin(np.zeros(plant.n))
 
@@ -100,7 +127,7 @@ class Estimator(CopiedWhole):
         """
         self.episode += not self._is_new
         self._is_new = False
-        self._histories = self._usual
+        self.histories = self._usual
         self._begin(mean)
 
     def restart(self, mean: np.ndarray, inputs: Sequence[np.ndarray]) -> None:
@@ -112,11 +139,8 @@ class Estimator(CopiedWhole):
             mean: An estimate, shape (n,), whose error lies in the certified set of age 0.
             inputs: What was applied since then, (m,) each, the newest first.
         """
-        shape = self._error_set.shape_at(0)
-        assert shape is not None
-        first = ErrorStatistics(self._plant.kalman_covariances[2], shape, 0, True)
-        coarsens = self._usual.coarsens
-        self._histories = histories_of(self._plant, self._channel, self._error_set, coarsens, first=first)
+        first = ErrorStatistics(self.plant.kalman_covariances[2], self.error_set.shapes[0], 0, True)
+        self.histories = histories_of(self.plant, self.channel, self.error_set, first=first)
         self._begin(mean, self.step - len(inputs))
         for u in reversed(inputs):
             self.advance(u, ())
@@ -126,24 +150,18 @@ class Estimator(CopiedWhole):
         self.step, self.age = step, 0
         self.alarm = self.damaged = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
-        self._history = self._histories.root
-        # By age: means before updates, inputs that led there, and samples.
-        self._priors: deque[np.ndarray] = deque(maxlen=self._buffer + 1)
-        self._inputs: deque[np.ndarray] = deque(maxlen=self._buffer + 1)
-        self._samples: deque[np.ndarray | None] = deque(maxlen=self._buffer + 1)
+        self.history = self.histories.root
+        self._remember((), (), ())
 
     @property
     def shape(self) -> np.ndarray:
         """Sigma_k, shape (n, n), read-only: x_hat - x lies in E(Sigma_k)."""
-        histories = self._histories
-        return histories.table.shape(histories.present.item(self._history))
+        return self.table.shape(self.histories.present.item(self.history))
 
     @property
-    def estimate(self) -> Estimate:
-        """What is known about the state now."""
-        histories = self._histories
-        covariance, shape, *_ = histories.table.statistics(histories.present.item(self._history))
-        return Estimate(self.mean.copy(), covariance.copy(), shape.copy(), self.step - self.age)
+    def covariance(self) -> np.ndarray:
+        """P, (n, n), of a Kalman filter that takes the same samples; picks gains and is never used for safety."""
+        return self.table.statistics(self.histories.present.item(self.history)).covariance
 
     def as_filterpy(self) -> Any:
         """Returns the present estimate as a `filterpy.kalman.KalmanFilter` with the model of this estimator, a copy.
@@ -153,9 +171,9 @@ class Estimator(CopiedWhole):
         """
         from filterpy.kalman import KalmanFilter  # takes long to import; it has no types
 
-        plant, recursion = self._plant, self._histories.recursion
+        plant, recursion = self.plant, self.histories.recursion
         kalman: Any = KalmanFilter(dim_x=plant.n, dim_z=plant.p, dim_u=plant.m)
-        kalman.x, kalman.P, _, _ = self.estimate
+        kalman.x, kalman.P = self.mean.copy(), self.covariance.copy()
         kalman.F, kalman.B, kalman.H = plant.A.copy(), plant.B.copy(), plant.H.copy()
         kalman.Q, kalman.R = recursion.Q.copy(), recursion.R.copy()
         return kalman
@@ -171,51 +189,36 @@ class Estimator(CopiedWhole):
         """
         self._is_new = False
         self.step += 1
-        self.age += 1
-        u = np.array(u, dtype=np.float64)
-        self.mean = frozen(self._predicted(self.mean, u))
-        self._priors.appendleft(self.mean)
-        self._inputs.appendleft(u)
-        self._samples.appendleft(None)
-        history = present = self._histories.after_step(self._history)
+        self._predict(np.array(u, dtype=np.float64), None)
+        history = present = self.histories.after_step(self.history)
         for packet in packets:
             history = self._take_in(packet, history)
-        self._history = present if history == present else self._replayed(history)
-        if self._histories.is_full:
-            full = self._histories
-            self._histories, kept = full.keeping(np.array([self._history]))
-            self._history = kept.item()
+        self.history = present if history == present else self._replayed(history)
+        if self.histories.is_full:
+            full = self.histories
+            self.histories, kept = full.keeping(np.array([self.history]))
+            self.history = kept.item()
             if self._usual is full:  # or it would stay in memory, and be full again after every reset
-                self._usual = self._histories
+                self._usual = self.histories
 
-    @property
-    def table(self) -> ErrorTable:
-        """The error shapes by the numbers that `numbered` returns; another one after shapes were forgotten."""
-        return self._histories.table
-
-    def predicted(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns estimate, (n,), and error shape, (n, n), after the next steps, given their inputs, (m,); read-only.
+    def numbered(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
+        """Returns estimate, (n,), and number of the error shape in `table` after the next steps, given inputs, (m,).
 
         It is what `advance` makes of the present estimate with these inputs and without packets: the error then lies in
         that ellipsoid, whatever packets arrive later.
         """
-        mean, number = self.numbered(inputs)
-        return mean, self.table.shape(number)
-
-    def numbered(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
-        """Returns what `predicted` does, the number of the error shape in `table` in place of the shape itself."""
         mean = self.mean
         for u in inputs:
             mean = frozen(self._predicted(mean, u))
-        histories = self._histories
-        return mean, histories.predicted(histories.present.item(self._history), len(inputs))
+        histories = self.histories
+        return mean, histories.predicted(histories.present.item(self.history), len(inputs))
 
     def _take_in(self, packet: Packet, history: int) -> int:
         """Returns the history with one more packet, and keeps its sample."""
         if packet.episode != self.episode:
             return history
         age = self.step - packet.stamp
-        after = self._histories.after_arrival(history, age)
+        after = self.histories.after_arrival(history, age)
         if after == history:
             before = self._samples[age] if 0 <= age < len(self._samples) else None
             if before is not None and before.tolist() != packet.measurement.tolist():
@@ -229,7 +232,7 @@ class Estimator(CopiedWhole):
 
     def _replayed(self, history: int) -> int:
         """Replays from the oldest new sample on, keeps whichever history is better, and returns the history then."""
-        histories, H = self._histories, self._plant.H
+        histories, H = self.histories, self.plant.H
         target, oldest = histories.after_replay(history), histories.replay_from.item(history)
         used, table = histories.used[:, history].tolist(), histories.table
         mean, means = self._priors[oldest], {}
@@ -252,16 +255,11 @@ class Estimator(CopiedWhole):
             self.age = new_age
         return target
 
-    def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns A x_hat + B u, shape (n,); an unstable plant's within the limit of its states."""
-        mean = self._plant.A.dot(mean) + self._plant.B.dot(u)
-        return mean if self._limit is None else np.minimum(np.maximum(mean, -self._limit), self._limit)
-
     def _test_exactly(self, residual: np.ndarray, statistics: int) -> None:
         """Latches the alarm if a residual y - H x_hat lies outside E(H Sigma H') + E(N).
 
         The ellipsoid of shape H Sigma H' + N, which the quick test is about, lies inside that sum.
         """
-        recursion, H = self._histories.recursion, self._plant.H
-        spread = H @ self._histories.table.shape(statistics) @ H.T
+        recursion, H = self.histories.recursion, self.plant.H
+        spread = H @ self.histories.table.shape(statistics) @ H.T
         self.alarm |= bool(outside_sum(residual[None], spread, recursion.sets.noise, ALARM_TOLERANCE)[0])

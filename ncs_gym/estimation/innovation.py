@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ncs_gym.uncertainty.ellipsoid import sum_gauge
+from ncs_gym.plants.hard_bounds import FLAT_INFLATION
 
 # An innovation this far beyond its exact bound counts as rounding, not as an alarm.
 ALARM_TOLERANCE = 1e-9
@@ -45,12 +45,10 @@ def outside_sum(points: np.ndarray, first: np.ndarray, second: np.ndarray, toler
     Args:
         points: r, shape (k, p).
         first: P1, shape (p, p), positive semidefinite.
-        second: P2, shape (p, p), positive definite; where it is not, in float64, each point takes much longer.
+        second: P2, shape (p, p), positive definite.
         tolerance: Relative.
     """
     axes, values = common_axes(first, second)
-    if not np.isfinite(axes).all():
-        return np.array([sum_gauge(point, first, second) > 1.0 + tolerance for point in points], np.bool_)
     return outside_sum_in_axes(np.square(axes @ points.T), values[:, None], tolerance)
 
 
@@ -58,7 +56,7 @@ def outside_sum_in_axes(squares: np.ndarray, values: np.ndarray, tolerance: floa
     """Returns which points lie outside E(P1) + E(P2), in axes in which both are diagonal, bool of shape (k,).
 
     Any multiplier nu splits r into P1 w / nu + P2 w / (1-nu) with w = (P1/nu + P2/(1-nu))^-1 r. If both parts lie in
-    their ellipsoids, r lies in the sum; if r'w > 1, it does not (see `sum_gauge`). r'w is concave in nu, and its slope
+    their ellipsoids, r lies in the sum; if r'w > 1, it does not. r'w is concave in nu, and its slope
     is the difference of the parts' squared gauges, so that halving finds a multiplier that decides.
 
     Args:
@@ -87,10 +85,14 @@ def outside_sum_in_axes(squares: np.ndarray, values: np.ndarray, tolerance: floa
 
 
 def common_axes(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns F, shape (p, p), and j >= 0, shape (p,), with F P1 F' = diag(j) and F P2 F' = I; NaN if P2 is flat."""
+    """Returns F, shape (p, p), and j >= 0, shape (p,), with F P1 F' = diag(j) and F P2 F' = I.
+
+    Where P2 is flat in float64 it is a little larger: what is then still outside of the sum is outside.
+    """
     try:
-        inverse = np.linalg.inv(np.linalg.cholesky(second))
+        root = np.linalg.cholesky(second)
     except np.linalg.LinAlgError:
-        return np.full_like(second, np.nan), np.full(len(second), np.nan)
+        root = np.linalg.cholesky(second + FLAT_INFLATION * np.diag(np.diag(first + second)))
+    inverse = np.linalg.inv(root)
     values, axes = np.linalg.eigh(inverse @ (0.5 * (first + first.T)) @ inverse.T)
     return axes.T @ inverse, np.maximum(values, 0.0)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.estimation.set_membership import COARSER, COARSEST_STEP, SHAPE_STEP, SetMembership
+from ncs_gym.estimation.set_membership import SHAPE_STEP, SetMembership
 from ncs_gym.plants.hard_bounds import FLAT_INFLATION
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import is_inside
@@ -89,25 +89,16 @@ class ErrorRecursion:
         first: ErrorStatistics | None = None,
     ) -> None:
         self.plant, self.error_set, self._bits = plant, error_set, covariance_bits
-        self._quantization_step = quantization_step
         self.sets = SetMembership(plant, quantization_step, error_set, shape_step)
         self.Q, self.R = plant.kalman_covariances[0], _sensor_covariance(plant, quantization_step)
         if first is None:
             shape = plant.initial_error.shape_matrix
-            first = ErrorStatistics(plant.kalman_covariances[2], shape, 0, is_inside(shape, error_set.shape_at(0)))
+            first = ErrorStatistics(plant.kalman_covariances[2], shape, 0, is_inside(shape, error_set.shapes[0]))
         self.first = first
         # Next to that of others, the deviation of a state that nothing disturbs would become smaller for ever, and all
         # would where nothing disturbs any: covariances would not recur. Deviations are no smaller than this share of
         # the largest one, each in units of what the certified set allows.
-        self._share, self._units = 2.0 ** -(covariance_bits + 4), np.sqrt(np.diag(error_set.shape_at(0)))
-
-    def coarser(self) -> ErrorRecursion:
-        """Returns a recursion that rounds shapes up more coarsely, so that fewer differ; itself if it is coarse."""
-        coarser = min(COARSER * self.sets.shape_step, COARSEST_STEP)
-        if coarser <= self.sets.shape_step:
-            return self
-        settings = self._bits, coarser, self.first
-        return ErrorRecursion(self.plant, self._quantization_step, self.error_set, *settings)
+        self._share, self._units = 2.0 ** -(covariance_bits + 4), np.sqrt(np.diag(error_set.shapes[0]))
 
     def predicted(self, statistics: ErrorStatistics) -> ErrorStatistics:
         """Returns the statistics one step later, without a sample."""
@@ -131,7 +122,7 @@ class ErrorRecursion:
         """
         covariance, shape, age, _ = statistics
         certified = self.error_set
-        newest = certified.shape_at(0)
+        newest = certified.shapes[0]
         kalman = self._kalman_update(covariance)
         covariance = covariance if kalman is None else kalman[1]
         gains = [self.sets.gain(shape)] if kalman is None else [kalman[0], self.sets.gain(shape)]

@@ -14,11 +14,6 @@ ROUNDING = 1e-13
 # Shapes are rounded up to multiples of this in coordinates where the certified set of age 0 is the unit ball: then they
 # recur when an arrival history does, and can be looked up.
 SHAPE_STEP = 2.0**-13
-# Where histories hardly recur so, the step becomes so many times larger, up to the coarsest one: beyond it shapes soon
-# reach the certified set.
-COARSER, COARSEST_STEP = 16.0, 2.0**-7
-# Margin for the rounding of an eigenvalue, in steps.
-EIGENVALUE_MARGIN = 1e-6
 # Multipliers mu that the set-membership gain is chosen from; any of them is sound.
 MULTIPLIERS = np.linspace(0.01, 0.99, 99)[:, None]
 
@@ -44,7 +39,7 @@ class SetMembership:
 
         self.plant, self.error_set, self.shape_step = plant, error_set, shape_step
         Sigma = error_set.Sigma
-        self._ball = np.linalg.cholesky(error_set.shape_at(0))
+        self._ball = np.linalg.cholesky(error_set.shapes[0])
         self._to_ball = solve_triangular(self._ball, np.eye(plant.n), lower=True)
         self._abs_ball, self._abs_to_ball = np.abs(self._ball), np.abs(self._to_ball)
         # Entries of |ball to_ball - I| are at most these.
@@ -149,20 +144,12 @@ class SetMembership:
         """Returns a shape rounded up to multiples of a step where the certified set of age 0 is the unit ball.
 
         Rounding moves an entry by half a step, hence no direction by more than n halves of one, which is added before.
-        Where steps are coarse, that of the usual step stays added, and of the coarse ones as many as are missing are
-        added afterwards, about a third of what they could take.
         """
         inward, outward, size = self._to_ball, self._ball, len(shape)
         extent = np.sqrt(np.abs(shape.diagonal()))
         inner = enlarged_by_rounding(inward.dot(shape).dot(inward.T), self._abs_to_ball.dot(extent))
-        is_coarse = self.shape_step > SHAPE_STEP
-        inner.flat[:: size + 1] += size * (0.5 * SHAPE_STEP if is_coarse else self.shape_step)
-        given = inner / self.shape_step
-        steps = np.rint(given)
-        if is_coarse:
-            missing = EIGENVALUE_MARGIN - np.linalg.eigvalsh(steps - given)[0]
-            steps.flat[:: size + 1] += max(np.ceil(missing), 0.0)
-        inner = self.shape_step * steps
+        inner.flat[:: size + 1] += size * self.shape_step
+        inner = self.shape_step * np.rint(inner / self.shape_step)
         reach = self._abs_ball.dot(np.sqrt(inner.diagonal()))
         rounded = enlarged_by_rounding(outward.dot(inner).dot(outward.T), reach)
         # Both products together move the shape S by at most E S + S E', |E| at most `ball_error`; with s the extent and

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -10,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.estimation.arrival_histories import NO_REPLAY, ArrivalHistories
-from ncs_gym.estimation.error_table import NO_SAMPLE, UNKNOWN, ErrorTable
+from ncs_gym.estimation.error_table import NO_SAMPLE, UNKNOWN
+from ncs_gym.estimation.estimator import PastSteps
 from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum_in_axes
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import CopiedWhole, frozen
+from ncs_gym.validation import frozen
 
 
-class VectorEstimator(CopiedWhole):
+class VectorEstimator(PastSteps):
     """What `Estimator` does, for N environments.
 
     Args:
@@ -25,40 +25,26 @@ class VectorEstimator(CopiedWhole):
         size: N.
 
     Attributes:
-        mean: x_hat, shape (n, N).
-        age: Steps since the newest sample used was taken, shape (N,).
         alarm: Whether a measurement contradicted the assumed bounds in the episode, shape (N,).
         damaged: Whether one was no finite numbers, which the environment sees, shape (N,).
-        histories: The graph in use; another one after histories were forgotten.
         history: Number of each environment's history, shape (N,).
     """
 
     def __init__(self, plant: LinearPlant, histories: ArrivalHistories, size: int) -> None:
-        self.plant, self.histories = plant, histories
+        super().__init__(plant, histories, size)
         self.mean, self.age = np.zeros((plant.n, size)), np.zeros(size, np.int64)
         self.alarm, self.damaged = np.zeros((2, size), np.bool_)
         self.history = np.full(size, histories.root)
-        self._limit = plant.state_limit[:, None] if np.isfinite(plant.state_limit).all() else None
-        # By age: means before updates, inputs that led there, and samples (None where nobody sent).
-        self._priors: deque[np.ndarray] = deque(maxlen=histories.buffer + 1)
-        self._inputs: deque[np.ndarray] = deque(maxlen=histories.buffer + 1)
-        self._samples: deque[np.ndarray | None] = deque(maxlen=histories.buffer + 1)
 
     @property
     def statistics(self) -> np.ndarray:
         """Numbers of the error statistics, whose shapes are `histories.table.shapes`, shape (N,)."""
         return self.histories.present.take(self.history)
 
-    @property
-    def table(self) -> ErrorTable:
-        """The error shapes by the numbers that `numbered` returns."""
-        return self.histories.table
-
     def follow(self, histories: ArrivalHistories) -> None:
         """Goes on with a graph for more delays, that of the same plant."""
         self.histories, self.history = histories, histories.taking_over(self.histories, self.history)
-        for name in ("_priors", "_inputs", "_samples"):
-            setattr(self, name, deque(getattr(self, name), maxlen=histories.buffer + 1))
+        self._remember(self._priors, self._inputs, self._samples)
 
     def begin(self, chosen: Any, mean: np.ndarray) -> None:
         """Starts episodes in some environments with first estimates, shape (n, count)."""
@@ -78,11 +64,7 @@ class VectorEstimator(CopiedWhole):
         """
         if self.histories.is_full:
             self.histories, self.history = self.histories.keeping(self.history)
-        self.mean = frozen(self._predicted(self.mean, u))
-        self._priors.appendleft(self.mean)
-        self._inputs.appendleft(u)
-        self._samples.appendleft(samples)
-        self.age += 1
+        self._predict(u, samples)
         histories = self.histories
         self.history = self._follow(self.history, "next", histories.after_step)
         for age, arrives in arrivals:
@@ -161,11 +143,6 @@ class VectorEstimator(CopiedWhole):
         self.mean = frozen(np.where(accepted, mean, self.mean))
         self.age = np.where(new_age == UNKNOWN, self.age, new_age)
         self.history = target
-
-    def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns A x_hat + B u; unstable plants' within the limit of their states."""
-        mean = self.plant.A.dot(mean) + self.plant.B.dot(u)
-        return mean if self._limit is None else np.minimum(np.maximum(mean, -self._limit), self._limit)
 
     def _monitor(self, residual: np.ndarray, statistics: np.ndarray) -> None:
         """Latches the alarm of environments whose residual no error and no noise within their bounds explain.

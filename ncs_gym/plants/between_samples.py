@@ -12,9 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.model import zero_order_hold
+from ncs_gym.bounds import Bounds
+from ncs_gym.limits import Limits
+from ncs_gym.model import Model, zero_order_hold
 from ncs_gym.plants.hard_bounds import HardBounds
-from ncs_gym.validation import read_only, setting, shown
+from ncs_gym.validation import read_only, setting
 
 # A and B of a plant are those of its model in continuous time up to this, relative to the largest entry in units of the
 # limits.
@@ -43,10 +45,21 @@ class BetweenSamples(HardBounds):
     """What the limits say of times between samples.
 
     Attributes:
+        model, limits, bounds: What all follows from.
+        dt: Duration of a step [s].
+        state_names, state_units, input_names, input_units: The labels, with defaults.
         continuous_model: [Ac, Bc] that A and B were sampled from, shape (n, n + m); None if unknown.
         between_samples: Number of times per step at which the box counts; None for the sampling instants alone.
     """
 
+    model: Model
+    limits: Limits
+    bounds: Bounds
+    state_names: tuple[str, ...]
+    state_units: tuple[str, ...]
+    input_names: tuple[str, ...]
+    input_units: tuple[str, ...]
+    dt = setting("dt", "model.dt")
     continuous_model = setting("continuous_model", "model.continuous")
     between_samples = setting("between_samples", "limits.between_samples")
 
@@ -126,21 +139,11 @@ class BetweenSamples(HardBounds):
                 )
         if self.between_samples is None:
             return
-        if continuous is None:
+        has_remainder = any(each.is_left_out for each in self.bounds.disturbance.parts)
+        if continuous is None or self.past or has_remainder or self.step_offset.any():
             raise ValueError(
-                "between_samples needs a model that was sampled from one in continuous time (Model.sampled); plants "
-                "that model another process have none"
-            )
-        if self.past:
-            raise ValueError("between_samples is for plants without delays and without limits of rates")
-        if any(each.is_left_out for each in self.bounds.disturbance.parts):
-            raise ValueError(
-                "between_samples is for a plant without a remainder, which says nothing of the times between samples"
-            )
-        if self.step_offset.any():
-            raise ValueError(
-                "between_samples is for an operating point that rests without a constant disturbance: how much of "
-                f"{shown(self.step_offset.tolist())} per step has come by a time within a step is not known"
+                "between_samples needs a model that Model.sampled made, without delays, limits of rates and remainder, "
+                "at a point that rests without a constant disturbance: else nothing is known of times within a step"
             )
         if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
             raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")

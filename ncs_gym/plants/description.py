@@ -7,7 +7,6 @@ from textwrap import fill
 import numpy as np
 
 from ncs_gym.plants.between_samples import BetweenSamples
-from ncs_gym.plants.limit_values import LimitValues
 from ncs_gym.validation import counted
 
 # Columns of the description: where its texts begin, and where they end.
@@ -73,7 +72,7 @@ def assumptions_of(plant: BetweenSamples) -> tuple[str, ...]:
     return tuple(assumed)
 
 
-def row_limit(plant: LimitValues, j: int) -> str:
+def row_limit(plant: BetweenSamples, j: int) -> str:
     """Returns what limit j says: of those of the safe box, of the inputs, and of both together.
 
     That of a sum is in units of its largest entry.
@@ -117,7 +116,7 @@ def _factor(size: float) -> str:
     return "" if size == 1.0 else f"{size:.4g} "
 
 
-def outputs_of(plant: LimitValues) -> tuple[list[str], list[str]]:
+def outputs_of(plant: BetweenSamples) -> tuple[list[str], list[str]]:
     """Returns the names and units of the outputs: those of the states that are measured alone, else y1, y2."""
     names, units = [], []
     for j, row in enumerate(plant.H):

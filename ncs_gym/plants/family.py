@@ -17,11 +17,12 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import Ball, Bounds, Gaussian, Sum
+from ncs_gym.limits import sides
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.family import Family, entry_name, grid_size, matrices_of
 from ncs_gym.uncertainty.remainder import Remainder
-from ncs_gym.validation import as_flag, as_names, as_number, shown
+from ncs_gym.validation import as_flag, as_names, shown
 
 # Room for the rounding of a function's entries, in units of the largest one of their row where that varies.
 ROOM = 1e-12
@@ -145,7 +146,7 @@ def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
     """Returns a bound of the disturbances of all members, the one of the first if all have the same by themselves.
 
     What members that rest under a constant disturbance lack of an equilibrium by rounding is part of their bounds, and
-    is less than SAME_BOUND of the terms of a step. P_i <= P_0 + diag(row sums of |P_i - P_0|), as `_require_covered`
+    is less than SAME_BOUND of the terms of a step. P_i <= P_0 + diag(row sums of |P_i - P_0|), as `_is_covered`
     compares.
     """
     first = plants[0]
@@ -158,16 +159,13 @@ def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
     return Ellipsoid(shape + np.diag((2.0 * size + SAME_BOUND) * SAME_BOUND * widths**2))
 
 
-def _require_covered(first: LinearPlant, cover: Ellipsoid | None, plant: LinearPlant, name: str) -> None:
-    """Raises ValueError unless the bound of a member's disturbance is inside of the bound of the family's."""
+def _is_covered(first: LinearPlant, cover: Ellipsoid | None, plant: LinearPlant) -> bool:
+    """Returns whether the bound of a member's disturbance is inside of the bound of the family's."""
     off = np.abs(_disturbance_shape(plant) - _disturbance_shape(first))
     widths = _terms(first)
     excess = (off / (widths * widths[:, None])).sum(axis=1) * widths**2
     room = np.zeros(first.n) if cover is None else np.diag(cover.shape_matrix - _disturbance_shape(first))
-    if (excess > room).any():
-        raise ValueError(
-            f"the members of a family may differ in A and B alone, and {name} differs in Bounds(disturbance=...)"
-        )
+    return not (excess > room).any()
 
 
 def _disturbance_shape(plant: LinearPlant) -> np.ndarray:
@@ -207,7 +205,9 @@ def _of_function(function: Callable[..., LinearPlant], ranges: Any, monotone: bo
             "of A and B is monotone in each parameter, or give the list of plants whose convex hull holds yours"
         )
     names = as_names(list(ranges), tuple(map(str, ranges)), "the names of parameters")
-    ends = [_ends(name, value) for name, value in ranges.items()]
+    ends = [sides(value, 1, f"the range of {name}").ravel() for name, value in ranges.items()]
+    if not np.isfinite(ends).all():
+        raise ValueError(f"the ends of ranges must be finite, got {shown(ranges)}")
     corners = [np.array(corner) for corner in itertools.product(*ends)]
     plants = [function(**dict(zip(names, corner.tolist(), strict=True))) for corner in corners]
     _require_alike(plants)
@@ -244,15 +244,6 @@ def _terms_of_step(plants: list[LinearPlant], matrices: np.ndarray) -> np.ndarra
     return np.max(terms, axis=0) * (np.arange(n) < n - plants[0].past)
 
 
-def _ends(name: str, value: Any) -> tuple[float, float]:
-    if not isinstance(value, (tuple, list)) or len(value) != 2:
-        raise ValueError(f"the range of {name} must be a pair (low, high), got {shown(value)}")
-    low, high = (as_number(end, f"an end of the range of {name}") for end in value)
-    if not low < high:
-        raise ValueError(f"the range of {name} must be (low, high) with low < high, got {shown(value)}")
-    return low, high
-
-
 def _require_alike(plants: list[LinearPlant]) -> None:
     """Raises ValueError unless all are plants that differ in A and B alone, and in where they rest."""
     for each in plants:
@@ -264,12 +255,11 @@ def _require_alike(plants: list[LinearPlant]) -> None:
 
 def _require_member(first: LinearPlant, plant: Any) -> None:
     """Raises ValueError unless a plant can be a member of a family, and has the sizes of its first one."""
-    if not isinstance(plant, LinearPlant):
-        raise ValueError(f"the members of a family must be plants, got {shown(plant)}")
-    if plant.remainder is not None:
-        raise ValueError("a member of a family has a remainder of its own, for which no bound of the family is proved")
-    if plant.between_samples is not None:
-        raise ValueError("between_samples is not proved for a family: give its members without it")
+    if not isinstance(plant, LinearPlant) or plant.remainder is not None or plant.between_samples is not None:
+        raise ValueError(
+            "the members of a family must be plants without a remainder of their own and without between_samples, for "
+            f"which no bound of a family is proved, got {shown(plant)}"
+        )
     matrices_of(plant, (first.n, first.n + first.m + 1), np.zeros(plant.n + plant.m))
 
 
@@ -291,13 +281,17 @@ class _Shared:
         """Raises ValueError unless a plant, counted from where the first one is, has all that members share."""
         _require_member(self.first, plant)
         moved = _around_center(plant, _resting_points([self.first])[0])
-        for name, given in (_ROUNDED | _SAME).items():
-            one, other = getattr(self.first, name), getattr(moved, name)
-            if not _is_same(one, other, SAME if name in _ROUNDED else 0.0):
-                raise ValueError(
-                    f"the members of a family may differ in A and B alone, and {self.name} differs in {given}"
-                )
-        _require_covered(self.first, self.cover, plant, self.name)
+        names = [
+            given
+            for name, given in (_ROUNDED | _SAME).items()
+            if not _is_same(getattr(self.first, name), getattr(moved, name), SAME if name in _ROUNDED else 0.0)
+        ]
+        if not names and not _is_covered(self.first, self.cover, plant):
+            names = ["Bounds(disturbance=...)"]
+        if names:
+            raise ValueError(
+                f"the members of a family may differ in A and B alone, and {self.name} differs in {names[0]}"
+            )
 
 
 def _is_same(one: Any, other: Any, tolerance: float) -> bool:

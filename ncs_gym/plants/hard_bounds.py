@@ -12,8 +12,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import DELTA, Ball, Sum, pushes_of
-from ncs_gym.limits import FREE_REACH, reach_in_steps
-from ncs_gym.plants.limit_values import LimitValues
+from ncs_gym.limits import LimitValues
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from ncs_gym.validation import read_only, setting
@@ -22,6 +21,8 @@ from ncs_gym.validation import read_only, setting
 INFLATION = 1.0 + 1e-9
 # The same for directions in which a bound is flat: growth of its diagonal alone.
 FLAT_INFLATION = 1e-12
+# A state that the box says nothing of is as large as this many times what it reaches from rest in n steps.
+FREE_REACH = 100.0
 # No disturbance set is thinner than this, in squared half-widths of the safe box.
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
@@ -91,25 +92,28 @@ class HardBounds(LimitValues):
     """The bounds of disturbances, sensor noise and first estimates of a plant, by what is declared of them.
 
     Attributes:
+        n, m, p: Number of states, inputs and outputs.
         of_disturbance, of_sensor, of_first_error: What is declared of each.
         remainder: What the model leaves out of the process that really moves; None if nothing.
         delta: Probability that Gaussian noise is truncated at.
         gamma: Squared radius of the ball that disturbances add.
-        process_noise, sensor_noise, initial_noise: The truncated Gaussians, to which what lies in the next ones is
-            added.
+        process_noise, sensor_noise, initial_noise: The truncated Gaussians, to which what lies in the next is added.
         disturbance_bound, sensor_bound, initial_bound: What holds the rest of each; None if there is no other set.
         process_noise_cov, measurement_noise_cov, initial_cov: Q, R and P0 of the Gaussians; zero where there is none.
     """
 
+    n: int
+    m: int
+    p: int
     of_disturbance: Source
     of_sensor: Source
     of_first_error: Source
     remainder: Any
     delta: float
-    process_noise: TruncatedGaussian
-    sensor_noise: TruncatedGaussian
-    initial_noise: TruncatedGaussian
     gamma = setting("gamma", "of_disturbance.ball")
+    process_noise = setting("process_noise", "of_disturbance.noise")
+    sensor_noise = setting("sensor_noise", "of_sensor.noise")
+    initial_noise = setting("initial_noise", "of_first_error.noise")
     disturbance_bound = setting("disturbance_bound", "of_disturbance.bound")
     sensor_bound = setting("sensor_bound", "of_sensor.bound")
     initial_bound = setting("initial_bound", "of_first_error.bound")
@@ -134,7 +138,9 @@ class HardBounds(LimitValues):
         bounded = [each.shape_matrix for source in sources for each in source.bounded()]
         noise = [np.diag(each) for each in [*(source.noise.covariance for source in sources), *bounded]]
         reach = np.sqrt(np.sum(noise, axis=0))
-        return read_only(reach_in_steps(self.A, self.B, self.largest_input, reach))
+        for _ in range(self.n):
+            reach = exact.product(np.abs(np.hstack([self.A, self.B])), np.concatenate([reach, self.largest_input]))
+        return read_only(reach)
 
     @cached_property
     def _box_shape(self) -> np.ndarray:

@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from ncs_gym.bounds import DELTA, Bounds, Sum
-from ncs_gym.limits import Deviations, Limits
+from ncs_gym.limits import Limits, LimitValues
 from ncs_gym.model import Model, as_point
 from ncs_gym.plants.between_samples import BetweenSamples
 from ncs_gym.plants.description import assumptions_of, described
 from ncs_gym.plants.hard_bounds import Source, weight_of
+from ncs_gym.plants.past_inputs import with_past_inputs
 from ncs_gym.plants.resting_point import at_rest, with_residual
 from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, read_back
-from ncs_gym.validation import as_names, as_numbers, as_units, counted, read_only, reason_of, shown
+from ncs_gym.validation import as_names, as_numbers, counted, read_only, reason_of, shown
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -73,9 +74,11 @@ class LinearPlant(BetweenSamples):
         sums = self.bounds.sums(n, len(model.H))
         declared = sums[0].declared
         rest = at_rest(self.limits.around(model), declared.sized(n))
-        region = model.A, model.B, model.dt, *rest.box, rest.inputs, *rest.mixed
+        region = model.A, model.B, model.dt, rest.box, *rest.box_ends, rest.input_ends
+        region += rest.mixed_rows, *rest.mixed_ends
         self._set(bounds=Bounds(*sums), remainder=None, region=_digest(enumerate(region)))
-        self._take(rest)
+        whole = with_past_inputs(rest, model.delays, self.limits.change_within(rest.input_half))
+        self._set(**whole.values, n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
         self._declare([declared, *sums[1:]], rest)
         self._name()
         self._check_between_samples()
@@ -83,9 +86,9 @@ class LinearPlant(BetweenSamples):
             disturbance = Sum((*declared.parts, *owned))
             self._set(remainder=owned[0], bounds=replace(self.bounds, disturbance=disturbance))
 
-    def _declare(self, sums: list[Sum], rest: Deviations) -> None:
+    def _declare(self, sums: list[Sum], rest: LimitValues) -> None:
         """Keeps what is declared of the three uncertainties."""
-        n, rows = len(rest.A), rest.box.rows
+        n, rows = len(rest.A), rest.box
         weight, past = weight_of(rows, np.zeros(n)), self.past
         disturbance = Source.of(sums[0], weight, past, keeps_ball=True)
         if rest.lacking.any():
@@ -94,21 +97,20 @@ class LinearPlant(BetweenSamples):
             disturbance = disturbance._replace(bound=Ellipsoid(np.pad(held, (0, past))))
         sensor, first = Source.of(sums[1], np.eye(self.p)), Source.of(sums[2], weight, past)
         self._set(of_disturbance=disturbance, of_sensor=sensor, of_first_error=first)
-        self._set(process_noise=disturbance.noise, sensor_noise=sensor.noise, initial_noise=first.noise)
         self._set(delta=next((each.gaussian.delta for each in sums if each.gaussian), DELTA))
 
     def _name(self) -> None:
         """Keeps names and units of states and inputs."""
         labels = {} if self.labels is None else self.labels
-        if not isinstance(labels, Mapping) or not {*labels} <= {"states", "inputs"}:
+        fits = isinstance(labels, Mapping) and {*labels} <= {"states", "inputs"}
+        if not fits or not all(isinstance(each, Mapping) for each in labels.values()):
             form = '{"states": {name: unit, ...}, "inputs": {name: unit, ...}}'
             raise ValueError(f"labels must be {form}, either of which may be left out, got {shown(labels)}")
         for name, size, letter in (("state", self.n - self.past, "x"), ("input", self.m, "u")):
             given = labels.get(f"{name}s", {})
-            if not isinstance(given, Mapping):
-                raise ValueError(f"labels of {name}s must be a dictionary of names with units, got {shown(given)}")
             names = as_names([*given], tuple(f"{letter}{i + 1}" for i in range(size)), f"names of {name}s")
-            units = as_units([*given.values()], size, f"units of {name}s")
+            units = as_names([*given.values()], ("",) * size, f"units of {name}s")
+            units = tuple("" if unit == "1" else unit for unit in units)
             self._set(**{f"{name}_names": names, f"{name}_units": units})
         ages = [counted(age, "step") for age in range(self.past // self.m, 0, -1)]
         past = tuple(f"{name} of {age} ago" for age in ages for name in self.input_names)
@@ -177,30 +179,6 @@ class LinearPlant(BetweenSamples):
         if self.remainder is None:
             return self
         return replace(self, bounds=replace(self.bounds, disturbance=self.bounds.disturbance.declared))
-
-    @cached_property
-    def is_symmetric(self) -> bool:
-        """Whether the limits are |c_j x| <= 1 and |u_i| <= u_max_i, and no others."""
-        ends = bool((np.abs(self.box_ends) == 1.0).all() and np.array_equal(-self.input_low, self.input_high))
-        return ends and not len(self.mixed_rows)
-
-    @property
-    def box_rows(self) -> np.ndarray:
-        """Rows c_j of a symmetric safe box |c_j x| <= 1, shape (k, n); raises ValueError if limits are others."""
-        return self._if_symmetric(self.box, "box, box_low and box_high")
-
-    @property
-    def u_max(self) -> np.ndarray:
-        """Symmetric limits |u_i| <= u_max_i, shape (m,); raises ValueError if limits are others."""
-        return self._if_symmetric(self.input_high, "input_low and input_high")
-
-    def _if_symmetric(self, value: np.ndarray, instead: str) -> np.ndarray:
-        if not self.is_symmetric:
-            raise ValueError(
-                "the limits of this plant are not |c_j x| <= 1 and |u_i| <= u_max_i alone, and only these are taken by "
-                f"what was asked for (a plant has {instead}, mixed_rows and mixed_ends)"
-            )
-        return value
 
     @property
     def members(self) -> Any:

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from ncs_gym.limits import Deviations, Rows
+from ncs_gym.limits import LimitValues, Rows
 
 # Rows of the box keep inputs under way within this many times their limits. They never leave those, so the rows only
 # bound the safe set: closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
 STORED_INPUT_REACH = 4.0
 
 
-def with_past_inputs(own: Deviations, delay: int, half: np.ndarray, change: np.ndarray | None) -> Deviations:
+def with_past_inputs(own: LimitValues, delay: int, change: np.ndarray | None) -> LimitValues:
     """Returns the plant with the inputs that it has to remember as further states: x, u_{k-d}, .., u_{k-1}.
 
     Args:
         own: The plant of its own states.
         delay: d, the steps after which an input takes effect.
-        half: Half the range of the inputs, shape (m,).
         change: Largest change of each input from one step to the next, shape (m,); None for any.
     """
-    n, m = own.B.shape
+    (n, m), half = own.B.shape, own.input_half
     stored = m * (delay or int(change is not None))
     if not stored:
         return own
@@ -32,24 +31,29 @@ def with_past_inputs(own: Deviations, delay: int, half: np.ndarray, change: np.n
         B[:n] = own.B
     B[-m:] = np.eye(m)
     past = np.hstack([np.zeros((stored, n)), np.diag(np.tile(1.0 / (STORED_INPUT_REACH * half), stored // m))])
-    box = [Rows(np.pad(own.box.rows, ((0, 0), (0, stored))), *own.box[1:])]
-    box += [Rows(past, *np.tile(own.inputs / half, stored // m))]
+    box = [Rows(np.pad(own.box, ((0, 0), (0, stored))), own.box_ends)]
+    box += [Rows(past, np.tile(own.input_ends / half, stored // m))]
     # An input that takes effect later is in the limits of states and inputs when it does, and a state by then.
-    of_state, of_input = own.mixed.rows[:, :n], own.mixed.rows[:, n:]
+    of_state, of_input = own.mixed_rows[:, :n], own.mixed_rows[:, n:]
     others = np.zeros((len(of_state), stored + (0 if delay else m)))
     others[:, slice(m) if delay else slice(stored, None)] = of_input
-    coupled, mixed = Rows(np.hstack([of_state, others]), *own.mixed[1:]), []
+    coupled, mixed = Rows(np.hstack([of_state, others]), own.mixed_ends), []
     (box if delay else mixed).append(coupled)
     if change is not None:
         rates = np.hstack([np.zeros((m, n + stored - m)), -np.eye(m), np.eye(m)]) / change[:, None]
-        mixed.append(Rows(rates, -np.ones(m), np.ones(m)))
-    return own._replace(
+        mixed.append(Rows(rates, np.outer([-1.0, 1.0], np.ones(m))))
+    limited, together = Rows.joined(box, n + stored), Rows.joined(mixed, n + stored + m)
+    number = np.arange(len(limited.rows)) - len(own.box)
+    return own.replaced(
         A=A,
         B=B,
         H=np.pad(own.H, ((0, 0), (0, stored))),
-        box=Rows.joined(box, n + stored),
-        mixed=Rows.joined(mixed, n + stored + m),
-        state=np.concatenate([own.state, np.tile(own.input, stored // m)]),
+        box=limited.rows,
+        box_ends=limited.ends,
+        is_past_row=(number >= 0) & (number < stored),
+        mixed_rows=together.rows,
+        mixed_ends=together.ends,
+        operating_state=np.concatenate([own.operating_state, np.tile(own.operating_input, stored // m)]),
         step_offset=np.pad(own.step_offset, (0, stored)),
         past=stored,
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import pushes_of
-from ncs_gym.limits import Deviations
+from ncs_gym.limits import LimitValues
 from ncs_gym.model import residual
 from ncs_gym.plants.hard_bounds import weight_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -23,7 +23,7 @@ class MovedOperatingPointWarning(UserWarning):
     """A disturbance with two different ends moves the point that deviations are counted from."""
 
 
-def at_rest(own: Deviations, disturbance: Any) -> Deviations:
+def at_rest(own: LimitValues, disturbance: Any) -> LimitValues:
     """Returns a plant counted from where it rests: the point of its model, moved by the middle of a disturbance.
 
     Where that middle, E w, is not zero, this is an (x, u) with x = A x + B u + E w, of such points that nearest to the
@@ -41,7 +41,8 @@ def at_rest(own: Deviations, disturbance: Any) -> Deviations:
     E, middle = np.hstack([each for each, _ in pushes]), np.concatenate([each for _, each in pushes])
     x, u, missing = _resting(own, E, middle)
     rest = own.around(x, u)
-    state, applied = ([float(f"{each:.6g}") for each in point] for point in (rest.state, rest.input))
+    points = rest.operating_state, rest.operating_input
+    state, applied = ([float(f"{each:.6g}") for each in point] for point in points)
     if not rest.is_within:
         raise ValueError(
             f"the middle of this disturbance moves the operating point to {shown(state)} with input {shown(applied)}, "
@@ -53,10 +54,10 @@ def at_rest(own: Deviations, disturbance: Any) -> Deviations:
         MovedOperatingPointWarning,
     )
     step_offset = own.step_offset + exact.product(np.abs(E), np.abs(middle))
-    return rest._replace(step_offset=step_offset, lacking=np.abs(missing) + own.lacking)
+    return rest.replaced(step_offset=step_offset, lacking=np.abs(missing) + own.lacking)
 
 
-def _resting(own: Deviations, E: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _resting(own: LimitValues, E: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns x, u, in deviations from the model's point, and A x + B u + E w - x there, which is rounding.
 
     Raises:
@@ -64,8 +65,8 @@ def _resting(own: Deviations, E: np.ndarray, middle: np.ndarray) -> tuple[np.nda
     """
     from scipy.linalg import null_space  # takes long to import
 
-    (n, m), A, B, rows = own.B.shape, own.A, own.B, own.box.rows
-    reach = 0.5 * (own.inputs[1] - own.inputs[0])
+    (n, m), A, B, rows = own.B.shape, own.A, own.B, own.box
+    reach = 0.5 * np.ptp(own.input_ends, axis=0)
     widths = np.sqrt(1.0 / np.diag(weight_of(rows, np.abs(E @ middle))))
     balance = np.hstack([(np.eye(n) - A) * widths, -B * reach]) / widths[:, None]
     found = np.linalg.lstsq(balance, E @ middle / widths)[0]

@@ -113,11 +113,11 @@ class OpenedEnv(Process):
                 )
             low, high = space.low.ravel(), space.high.ravel()
             room = READ_BACK * np.maximum(np.abs(low), np.abs(high))
-            if (plant.input_high > high + room).any() or (plant.input_low < low - room).any():
+            if ((plant.input_ends - [low, high]) * [[-1.0], [1.0]] > room).any():
+                least, most = plant.input_ends.tolist()
                 raise ValueError(
-                    f"the input limits, {shown(plant.input_low.tolist())} to {shown(plant.input_high.tolist())}, go "
-                    f"beyond the actions, {shown(low.tolist())} to {shown(high.tolist())}: choose closer ones, or give "
-                    "GymProcess write_action"
+                    f"the input limits, {shown(least)} to {shown(most)}, go beyond the actions, {shown(low.tolist())} "
+                    f"to {shown(high.tolist())}: choose closer ones, or give GymProcess write_action"
                 )
         return space.dtype, space.shape
 

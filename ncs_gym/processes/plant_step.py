@@ -11,7 +11,7 @@ import numpy as np
 from ncs_gym.bounds import Bounds
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import FamilyProcess, LinearProcess, Process, own_process
-from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, checked_many, stays_inside
+from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import guarded, read_only
 
@@ -143,10 +143,7 @@ class PlantSimulation:
                 inside = noise / np.maximum(self.plant.process_noise.bound.gauge(noise.T), 1.0)
                 excess = noise - inside
             d = d + inside
-        if count is None:
-            total = checked(self.plant, d, allow_assumption_violation=self._allow)
-        else:
-            total = checked_many(self.plant, d, count, allow_assumption_violation=self._allow)
+        total = checked(self.plant, d, count, allow_assumption_violation=self._allow)
         return total if excess is None else total + excess
 
     def _draw_sensor_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:

@@ -166,7 +166,7 @@ def farthest_equilibrium(plant: LinearPlant, output: np.ndarray) -> float:
         found = linprog(
             -sign * np.concatenate([output, np.zeros(m)]) * scale,
             A_ub=np.concatenate([rows, -rows]) * scale,
-            b_ub=np.concatenate([plant.box_high, -plant.box_low]),
+            b_ub=np.concatenate([plant.box_ends[1], -plant.box_ends[0]]),
             A_eq=balance * scale,
             b_eq=np.zeros(n),
             bounds=[(None, None)] * n + list(zip(low, high, strict=True)),

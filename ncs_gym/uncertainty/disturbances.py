@@ -16,7 +16,7 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.shared import begun_many, storing_nothing
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, sum_gauge
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import (
     LARGEST_NUMBER,
     ReadOnlyArrays,
@@ -95,12 +95,8 @@ class Disturbance(ReadOnlyArrays, ABC):
         with storing_nothing(self):
             return np.array([self.draw(rng, plant, nominal, step, own) for nominal, step, own in each]).T
 
-    def check(self, plant: LinearPlant) -> str:
-        """Returns why this disturbance does not fit the plant, or an empty string."""
-        return ""
-
-    def excess(self, plant: LinearPlant) -> str:
-        """Returns why it may go beyond the plant's bound (which can be allowed), or an empty string."""
+    def check(self, plant: LinearPlant, *, may_leave: bool = False) -> str:
+        """Returns why this disturbance does not fit the plant, or may leave its bound, or an empty string."""
         return ""
 
 
@@ -143,8 +139,7 @@ class BoxDisturbance(Disturbance):
         widths = as_vector(self.half_widths, None, "half_widths")
         if (widths < 0.0).any():
             raise ValueError(f"half_widths must be >= 0, got {widths.tolist()}")
-        object.__setattr__(self, "half_widths", widths)
-        self._make_arrays_read_only()
+        self._set(half_widths=widths)
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         widths = np.sqrt(plant.gamma / plant.n) if self.half_widths is None else np.asarray(self.half_widths)
@@ -154,29 +149,18 @@ class BoxDisturbance(Disturbance):
             return d
         return d + sample_box(bound, rng, None if nominal_next.ndim == 1 else nominal_next.shape[1])
 
-    def check(self, plant):  # noqa: D102
+    def check(self, plant, *, may_leave=False):  # noqa: D102
         if self.half_widths is None:
             return ""
-        widths = np.asarray(self.half_widths)
+        widths, bound = np.asarray(self.half_widths), _declared(plant)
         if widths.shape != (plant.n,):
             return f"half_widths must have {plant.n} entries, got {widths.size}"
-        return ""
-
-    def excess(self, plant):  # noqa: D102
-        if self.half_widths is None:
+        # Of a set with the coordinates as axes, all corners lie equally far out; E(P1 + P2) is inside of E(P1) + E(P2).
+        inside = plant.gamma * np.eye(plant.n) + (0.0 if bound is None else diagonal_inside(bound))
+        size = Ellipsoid(inside).gauge(widths)
+        if may_leave or size <= 1.0 + ROUNDING:
             return ""
-        bound, corner = _declared(plant), np.asarray(self.half_widths)
-        if bound is None:
-            length = float(np.sum(np.square(corner)))
-            if length > plant.gamma * (1.0 + ROUNDING):
-                allowed = f"the ball in the plant's Bounds(disturbance=...) has radius {np.sqrt(plant.gamma):g}"
-                return f"the corner of the box is {np.sqrt(length):g} long, {allowed}"
-            return ""
-        # Of sets with the coordinates as axes, all corners lie equally far out.
-        size = sum_gauge(corner, plant.gamma * np.eye(plant.n), diagonal_inside(bound))
-        if size > 1.0 + ROUNDING:
-            return f"the box is {size:.6g} times as large as one within the plant's Bounds(disturbance=...) may be"
-        return ""
+        return f"the corner of the box is {size:.6g} times as far out as the plant's Bounds(disturbance=...) allow"
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +181,7 @@ class SinusoidDisturbance(Disturbance):
     vectorized: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "period", as_number(self.period, "period", low=0.0, low_open=True))
+        self._set(period=as_number(self.period, "period", low=0.0, low_open=True))
 
     def begin(self, rng, plant, size=None):  # noqa: D102
         axes = np.sqrt(plant.gamma) * _unit_ball(plant.n).sample_boundary(rng, size)
@@ -285,10 +269,9 @@ class AdversarialDisturbance(Disturbance):
 
     def __post_init__(self) -> None:
         if self.M is not None:
-            object.__setattr__(self, "M", as_covariance(self.M, None, "M"))
+            self._set(M=as_covariance(self.M, None, "M"))
         if self.rows is not None:
-            object.__setattr__(self, "rows", as_matrix(self.rows, (None, None), "rows"))
-        self._make_arrays_read_only()
+            self._set(rows=as_matrix(self.rows, (None, None), "rows"))
 
     def draw(self, rng, plant, nominal_next, step, memory):  # noqa: D102
         bound = plant.nominal_disturbance
@@ -307,7 +290,7 @@ class AdversarialDisturbance(Disturbance):
         signs = np.where(np.take_along_axis(above >= below, worst[..., None], axis=-1)[..., 0], 1.0, -1.0)
         return (1.0 - ROUNDING) * signs * extremes[:, places.reshape(worst.shape)]
 
-    def check(self, plant):  # noqa: D102
+    def check(self, plant, *, may_leave=False):  # noqa: D102
         if self.M is not None and self.M.shape != (plant.n, plant.n):
             return f"M must have shape ({plant.n}, {plant.n}), got {self.M.shape}"
         if self.rows is not None and self.rows.shape[1] != plant.n:
@@ -359,10 +342,7 @@ def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: b
         raise ValueError(
             f"disturbance must be one of {sorted(BY_NAME)}, a Disturbance or a callable, got {shown(value)}"
         )
-    problem = value.check(plant)
-    if not problem and not allow_assumption_violation:
-        problem = value.excess(plant)
-    if problem:
+    if problem := value.check(plant, may_leave=allow_assumption_violation):
         raise ValueError(f"{type(value).__name__}: {problem}")
     return value
 
@@ -388,35 +368,23 @@ def as_noise(value: Any, plant: LinearPlant) -> str:
     return value
 
 
-def checked(plant: LinearPlant, d: Any, *, allow_assumption_violation: bool) -> np.ndarray:
-    """Returns a disturbance as an array of shape (n,) inside E(D), scaled back to leave room for rounding.
-
-    Raises:
-        ValueError: If it is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
-    """
-    d = as_vector(d, plant.n, "the disturbance")
-    if allow_assumption_violation:
-        return d
-    if (size := plant.disturbance.gauge(d)) > 1.0 + TOLERANCE:
-        raise ValueError(
-            f"the disturbance {d.tolist()} lies outside its bound E(D): sqrt(d' D^-1 d) = {size:.6g} > 1 "
-            "(allow_assumption_violation=True lets it pass)"
-        )
-    size = plant.allowed_disturbance.gauge(d)
-    return d if size <= 1.0 - ROUNDING else d * ((1.0 - ROUNDING) / size)
-
-
-def checked_many(plant: LinearPlant, d: Any, count: int, *, allow_assumption_violation: bool) -> np.ndarray:
-    """Returns disturbances of many environments as `checked` does, shape (n, count).
+def checked(plant: LinearPlant, d: Any, count: int | None = None, *, allow_assumption_violation: bool) -> np.ndarray:
+    """Returns disturbances as an array, shape (n,) or (n, count), inside E(D), scaled back to leave room for rounding.
 
     Raises:
         ValueError: If one is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.
     """
-    given, d = d, as_setting(d)
-    if d is None or d.shape != (plant.n, count) or not (np.abs(d) < LARGEST_NUMBER).all():
-        raise ValueError(f"the disturbances must be finite with shape ({plant.n}, {count}), got {shown(given)}")
+    given, d, shape = d, as_setting(d), (plant.n,) if count is None else (plant.n, count)
+    if d is None or d.shape != shape or not (np.abs(d) < LARGEST_NUMBER).all():
+        raise ValueError(f"a disturbance must be finite with shape {shape}, got {shown(given)}")
     if allow_assumption_violation:
         return d
     for each in np.flatnonzero(plant.allowed_disturbance.gauge(d.T) > 1.0 - ROUNDING):
-        d[:, each] = checked(plant, d[:, each], allow_assumption_violation=False)
+        one = d if count is None else d[:, each]
+        if (size := plant.disturbance.gauge(one)) > 1.0 + TOLERANCE:
+            raise ValueError(
+                f"the disturbance {one.tolist()} lies outside its bound E(D): sqrt(d' D^-1 d) = {size:.6g} > 1 "
+                "(allow_assumption_violation=True lets it pass)"
+            )
+        one *= (1.0 - ROUNDING) / max(plant.allowed_disturbance.gauge(one), 1.0 - ROUNDING)
     return d

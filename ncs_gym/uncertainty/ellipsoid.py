@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, outer_sum
+from ncs_gym.uncertainty.shape_matrices import outer_sum
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, read_only
 
 if TYPE_CHECKING:
@@ -85,9 +85,9 @@ class UncertainSet(ReadOnlyArrays, ABC):
 
 
 def document_of(value: Any) -> Any:
-    """Returns a set, or what values of a plant are made of, as JSON values in which infinity is the text "inf"."""
-    if isinstance(value, UncertainSet):
-        return value.document
+    """Returns what has a document, or is a part of one, as JSON values in which infinity is the text "inf"."""
+    if hasattr(value, "document"):
+        return document_of(value.document)
     if isinstance(value, tuple | list):
         return [*map(document_of, value)]
     if isinstance(value, dict):
@@ -267,41 +267,6 @@ def _trust_region_root(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
         if not moving.any():
             break
     return root
-
-
-def sum_gauge(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
-    """Returns sqrt(max over nu of r'(P1/nu + P2/(1-nu))^-1 r): at most 1 exactly if r is in E(P1) + E(P2).
-
-    The intersection of all E(P1/nu + P2/(1-nu)) is the Minkowski sum, and the form is concave in nu
-    (docs/shield_proof.md, "Sums"). A result above 1 proves that the point lies outside.
-
-    Args:
-        point: r, shape (n,).
-        first: P1, shape (n, n), positive semidefinite.
-        second: P2, shape (n, n), positive semidefinite.
-    """
-
-    def gauge(nu: float) -> float:
-        shape = first / nu + second / (1.0 - nu)
-        return Ellipsoid(0.5 * (shape + shape.T)).gauge(point)
-
-    # In units in which neither overflows: the gauge does not change.
-    size = float(max(np.abs(np.diag(first)).max(), np.abs(np.diag(second)).max()))
-    if 0.0 < size < np.inf:
-        point, first, second = point / size**0.5, first / size, second / size
-    if not np.any(second):
-        return Ellipsoid(first).gauge(point)
-    if not np.any(first):
-        return Ellipsoid(second).gauge(point)
-    from scipy.optimize import minimize_scalar  # takes long to import
-
-    best: Any = minimize_scalar(
-        lambda nu: -gauge(nu),
-        bounds=(SMALLEST_MULTIPLIER, 1.0 - SMALLEST_MULTIPLIER),
-        method="bounded",
-        options={"xatol": 1e-9},
-    )
-    return max(-float(best.fun), gauge(0.5))
 
 
 def ellipsoid_around_sum(weight: np.ndarray, first: Ellipsoid, *others: Ellipsoid | None) -> Ellipsoid:

@@ -58,31 +58,29 @@ class Family(ReadOnlyArrays):
     check: Callable[[LinearPlant], None] | None = None
 
     def __post_init__(self) -> None:
-        members = as_numbers(self.members)
+        members, interval = as_numbers(self.members), self.interval
         if members is None or members.ndim != 3 or not len(members) or not np.isfinite(members).all():
             raise ValueError(
                 f"the members of a family must be finite with shape (N, n, n + m + 1), got {shown(members)}"
             )
         parameters = as_matrix(self.parameters, (len(members), None), "the parameters of a family")
         default = tuple(f"p{number + 1}" for number in range(parameters.shape[1]))
-        object.__setattr__(self, "names", as_names(self.names, default, "the names of parameters"))
-        object.__setattr__(self, "parameters", parameters)
-        object.__setattr__(self, "members", np.array(members))
-        if self.interval is not None:
-            interval = as_numbers(self.interval)
+        names = as_names(self.names, default, "the names of parameters")
+        of_plants = interval is None and self.function is None
+        if of_plants != (names == ("member",)) or (self.function is not None and (interval is None or not self.check)):
+            raise ValueError(
+                "a family of parameters needs the interval of its entries, and that of a function the check of its "
+                "members; a family of plants has neither"
+            )
+        if interval is not None:
+            interval = as_numbers(interval)
             if interval is None or interval.shape != (2, *members.shape[1:]):
                 raise ValueError(f"the interval of a family must have shape {(2, *members.shape[1:])}")
             if not ((interval[0] <= members) & (members <= interval[1])).all():
                 raise ValueError("the members of a family must lie in its interval")
-            object.__setattr__(self, "interval", np.array(interval))
-        if self.center is not None:
-            object.__setattr__(self, "center", as_vector(self.center, members.shape[2] - 1, "the center"))
-        if (self.names != ("member",)) != (self.interval is not None):
-            raise ValueError("a family of parameters needs the interval of its entries, and one of plants has none")
-        if self.function is not None and (self.interval is None or self.check is None):
-            raise ValueError("a family of a function needs its interval, and the check of its members")
-        object.__setattr__(self, "at_rest", as_flag(self.at_rest, "at_rest"))
-        self._make_arrays_read_only()
+        center = None if self.center is None else as_vector(self.center, members.shape[2] - 1, "the center")
+        self._set(names=names, parameters=parameters, members=members, interval=interval, center=center)
+        self._set(at_rest=as_flag(self.at_rest, "at_rest"))
 
     @property
     def document(self) -> dict[str, Any]:
@@ -250,18 +248,15 @@ def grid_size(parameters: int) -> int:
     return max(int(GRID ** (1.0 / parameters) + 1e-9), 3)
 
 
-def matrices_of(plant: Any, shape: tuple[int, ...], center: np.ndarray) -> np.ndarray:
+def matrices_of(plant: LinearPlant, shape: tuple[int, ...], center: np.ndarray) -> np.ndarray:
     """Returns [A, B, s] of a plant in deviations from a state and input, (n + m,), where its step is s.
 
     It is at rest at its own operating point (x_i, u_i): s = (A - I)(x - x_i) + B (u - u_i), rounded once.
 
     Raises:
-        ValueError: If it is no plant, or of another shape.
+        ValueError: If it is of another shape.
     """
-    A, B = getattr(plant, "A", None), getattr(plant, "B", None)
-    if not isinstance(A, np.ndarray) or not isinstance(B, np.ndarray):
-        raise ValueError(f"the function of a family must return a LinearPlant, got {shown(plant)}")
-    n, m = B.shape
+    A, B, (n, m) = plant.A, plant.B, plant.B.shape
     if (n, n + m + 1) != shape:
         wanted = (shape[0], shape[1] - 1)
         raise ValueError(f"the plants of a family must have [A, B] of the same shape {wanted}, got {(n, n + m)}")

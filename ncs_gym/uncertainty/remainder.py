@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import InitVar, dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ncs_gym.bounds import as_set
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, UncertainSet, document_of
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, UncertainSet
 from ncs_gym.uncertainty.family import Family
 from ncs_gym.validation import as_flag, require_short_text, shown
 
@@ -19,7 +19,7 @@ class Remainder(UncertainSet):
     """f(x, u) - A x - B u lies in an ellipsoid, for x in the safe box and u within its limits (both in common ones).
 
     It is a part of `Bounds.disturbance`. The one that a plant keeps belongs to the model and the limits of that plant,
-    and no plant of others takes it over. Whether its bound is proved has to be said again with `dataclasses.replace`.
+    and no plant of others takes it over.
     Of a family, the plant works the bound out of the members itself.
 
     Attributes:
@@ -30,34 +30,26 @@ class Remainder(UncertainSet):
         family: The plants that the process is one of, of which each episode has another (`ncs_gym.family`); None if it
             is something else.
         belongs_to: `LinearPlant.region` of the plant that it belongs to; None before any has it.
-        is_proved: `proved`.
 
     Raises:
-        ValueError: If the bound is not an ellipsoid, `proved` no truth value, `basis` no text, or `family` none.
+        ValueError: If one of these is of another kind.
     """
 
-    bound: Ellipsoid
-    proved: InitVar[bool]
+    bound: Any
+    proved: bool
     basis: str
-    family: Family | None = None
+    family: Any = None
     belongs_to: str | None = None
-    is_proved: bool = field(init=False)
     is_left_out: ClassVar[bool] = True
 
-    def __post_init__(self, proved: bool) -> None:
-        if isinstance(self.bound, Mapping):  # of a document
-            object.__setattr__(self, "bound", as_set(self.bound))
-        if isinstance(self.family, Mapping):
-            object.__setattr__(self, "family", Family(**self.family))
-        if not isinstance(self.bound, Ellipsoid):
-            raise ValueError(f"the bound of a remainder must be an Ellipsoid, got {shown(self.bound)}")
-        object.__setattr__(self, "is_proved", as_flag(proved, "proved"))
-        object.__setattr__(self, "size", self.bound.dim)
-        if not isinstance(self.basis, str):
-            raise ValueError(f"the basis of a remainder must be text, got {shown(self.basis)}")
+    def __post_init__(self) -> None:
+        bound = as_set(self.bound) if isinstance(self.bound, Mapping) else self.bound  # of a document
+        family = Family(**self.family) if isinstance(self.family, Mapping) else self.family
+        if not (isinstance(bound, Ellipsoid) and isinstance(self.basis, str) and isinstance(family, Family | None)):
+            found = f"{shown(bound)}, {shown(self.basis)} and {shown(family)}"
+            raise ValueError(f"a remainder has an Ellipsoid, a text as its basis and a Family or None, got {found}")
         require_short_text(self.basis, "the basis of a remainder")
-        if not isinstance(self.family, Family | None):
-            raise ValueError(f"the family of a remainder must be a Family, got {shown(self.family)}")
+        self._set(bound=bound, family=family, proved=as_flag(self.proved, "proved"), size=bound.dim)
 
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
         return self.bound
@@ -76,22 +68,16 @@ class Remainder(UncertainSet):
                 "the middle of a disturbance moves): find the model anew by ncs_gym.linear_model, or give "
                 "Remainder(bound, proved, basis) anew if it holds for this plant, too"
             )
-        return self if self.belongs_to else replace(self, proved=self.is_proved, belongs_to=plant.region)
+        return self if self.belongs_to else replace(self, belongs_to=plant.region)
 
     @property
     def numbers(self) -> list[tuple[str, Any]]:
         """What identifies a plant with it."""
         members = [] if self.family is None else [("members", self.family.members)]
-        return [("remainder", self.bound.shape_matrix), ("proved", self.is_proved), *members]
-
-    @property
-    def document(self) -> dict[str, Any]:  # noqa: D102
-        family = None if self.family is None else self.family.document
-        values = {"bound": self.bound, "proved": self.is_proved, "basis": self.basis, "family": family}
-        return {"Remainder": document_of(values | {"belongs_to": self.belongs_to})}
+        return [("remainder", self.bound.shape_matrix), ("proved", self.proved), *members]
 
     @property
     def sentence(self) -> str:
         """What a certificate says about it."""
-        kind = "bounded by proof" if self.is_proved else "assumed to lie in its bound"
+        kind = "bounded by proof" if self.proved else "assumed to lie in its bound"
         return f"What the linear model leaves out is {kind} while the state is in the box: {self.basis}."

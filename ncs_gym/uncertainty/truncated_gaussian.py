@@ -9,7 +9,7 @@ import numpy as np
 from flint import arb, ctx, fmpq
 
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.validation import ReadOnlyArrays, as_number
+from ncs_gym.validation import ReadOnlyArrays
 
 # A truncation that keeps less than this probability would make rejection sampling crawl.
 SMALLEST_KEPT = 1e-3
@@ -74,6 +74,7 @@ class TruncatedGaussian(ReadOnlyArrays):
         return normals
 
 
+@cache
 def truncation_energy(delta: float, degrees: int) -> float:
     """Returns chi2_{degrees, 1 - delta}, rounded up: the smallest float64 exceeded with at most probability delta.
 
@@ -82,15 +83,7 @@ def truncation_energy(delta: float, degrees: int) -> float:
     Args:
         delta: Probability that is cut off, in [1e-12, 0.999].
         degrees: Degrees of freedom, >= 1.
-
-    Raises:
-        ValueError: If delta is out of range.
     """
-    return _energy(as_number(delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT), degrees)
-
-
-@cache
-def _energy(delta: float, degrees: int) -> float:
     low, high = 0.0, 1.0
     while _cuts_off_more(high, delta, degrees):
         low, high = high, 2.0 * high

@@ -12,7 +12,7 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from ncs_gym.estimation.error_bound import require_error_set
-from ncs_gym.estimation.error_sets import ErrorSetsByAge
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
 from ncs_gym.validation import ReadOnlyArrays
 from shields.certificate import Certificate, CertificateError, Updates
@@ -83,7 +83,7 @@ class BoardTable(ReadOnlyArrays):
         ready = SafetyFilter(certificate, plant, "switch")
         test, reach, shapes = ready.test, SIMULATED_REACH * plant.half_widths, [*certificate.error_shapes, updates.last]
         require_error_set(
-            ErrorSetsByAge(
+            ErrorSet(
                 contract=updates.contract,
                 shapes=np.array(shapes),
                 rates=np.array([proof.rate for proof in certificate.proofs]),
@@ -106,8 +106,8 @@ class BoardTable(ReadOnlyArrays):
             **{name: getattr(plant, name) for name in "ABH"},
             K=certificate.K,
             constant=certificate.fallback.constant,
-            low=plant.input_low,
-            high=plant.input_high,
+            low=plant.input_ends[0],
+            high=plant.input_ends[1],
             far=reach - np.sqrt(np.diagonal(shapes, axis1=1, axis2=2).max(axis=0)),
             T=updates.gains,
             alarm=residuals * (1.0 + ALARM_TOLERANCE) + test.rounding * (np.abs(plant.H) @ reach),

@@ -92,7 +92,7 @@ def _vectors(table: BoardTable, plant: LinearPlant, certificate: Certificate) ->
                     stamp, y = [(stamp, np.full(plant.p, np.nan)), (step + 1, y), (stamp, y + 1e3)][rng.integers(3)]
                 yield f"sample {of} {stamp} {_text(y)}"
                 board.receive(of, stamp, y)
-            outwards = plant.input_high if step % 50 < 25 else plant.input_low
+            outwards = plant.input_ends[int(step % 50 < 25)]
             proposed = rng.choice([-1.0, 1.0, 1.0, 3.0, 0.1], plant.m) * outwards
             proposed = np.full(plant.m, np.nan) if rng.random() < 0.01 else proposed
             estimate = board.estimate

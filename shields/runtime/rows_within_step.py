@@ -59,7 +59,7 @@ def rows_within_step(plant: LinearPlant) -> RowsWithinStep:
     """Returns the rows of a plant's limits within a step."""
     rows, grid, n = plant.box, plant.grid_rows, plant.n
     of_state, of_input, (low, high) = plant.mixed_rows[:, :n], plant.mixed_rows[:, n:], plant.mixed_ends
-    disturbed, at_samples, ends = np.zeros(len(low)), rows, (plant.box_low, plant.box_high)
+    disturbed, at_samples, ends = np.zeros(len(low)), rows, plant.box_ends
     if grid is not None:
         D, rounding = plant.disturbance.shape_matrix, 8.0 * n * float(np.finfo(float).eps)
         left = (1.0 - grid.remainder) / _OUTWARD

@@ -144,7 +144,7 @@ class SafeLoop(CopiedWhole):
         if not isinstance(channel, Channel):
             raise ValueError(f"channel must be a Channel (its contract is the certificate's), got {shown(channel)}")
         self._contract = certificate.contract
-        histories = arrival_histories(plant, channel, self._contract, coarsens=True)
+        histories = arrival_histories(plant, channel, self._contract)
         self._estimator = Estimator(plant, channel, histories=histories)
         protocol = downlink_protocol(downlink, downlink_contract)
         self._guard, self._decided = OneGuard(self._filter, protocol, on_unproved), np.zeros(plant.m)
@@ -498,7 +498,8 @@ class SafeLoop(CopiedWhole):
 
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns estimate and error shape of the time at which the next input takes effect."""
-        return self._estimator.predicted(self._inputs.pending[: self._input_delay])
+        estimate, number = self._estimator.numbered(self._inputs.pending[: self._input_delay])
+        return estimate, self._estimator.table.shape(number)
 
 
 def _as_input(given: Any, shape: tuple[int, ...]) -> np.ndarray | None:

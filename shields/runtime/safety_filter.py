@@ -94,7 +94,7 @@ class SafetyFilter(ReadOnlyArrays):
         object.__setattr__(self, "test", certificate_test(self.certificate, self.plant))
         object.__setattr__(self, "_no_plan", read_only(np.empty((0, self.plant.m))))
         fallback = self.certificate.fallback
-        columns = {"_constant": fallback.constant, "_low": self.plant.input_low, "_high": self.plant.input_high}
+        columns = {"_constant": fallback.constant, "_low": self.plant.input_ends[0], "_high": self.plant.input_ends[1]}
         for name, each in columns.items():
             object.__setattr__(self, name, read_only(each[:, None]))
         object.__setattr__(self, "_remembered", {})

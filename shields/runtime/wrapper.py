@@ -130,7 +130,7 @@ class SafetyShield(_Shield, gym.Wrapper):
     In mode "lookahead" an input passes too if a certified plan that begins with it keeps the state in the box until it
     is in S; `shield_guaranteed` then says whether the state is proved to be in the box now and to stay there.
 
-    Where the plant models another process, that is proved of the process only if `plant.remainder.is_proved`; else it
+    Where the plant models another process, that is proved of the process only if `plant.remainder.proved`; else it
     rests on the assumption that sampling found the largest remainder (docs/beyond_linear.md).
 
     Args:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Ellipsoid, ErrorSet, LinearPlant, exact
-from ncs_gym.estimation.error_sets import ErrorSetsByAge
 from ncs_gym.plants.hard_bounds import inflated
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import reach_in
@@ -58,7 +57,7 @@ def proofs_of(
 
 def _updates(errors: ErrorSet) -> Updates | None:
     """Returns what a channel contract adds to the proofs; None without one."""
-    if not isinstance(errors, ErrorSetsByAge):
+    if errors.contract is None:
         return None
     return Updates(
         contract=errors.contract,
@@ -140,7 +139,7 @@ def volume_of(plant: LinearPlant, L: np.ndarray) -> float:
 
     It is where the box has a center, a point in the middle between all of its pairs of ends.
     """
-    middle, half = 0.5 * (plant.box_low + plant.box_high), 0.5 * (plant.box_high - plant.box_low)
+    middle, half = 0.5 * plant.box_ends.sum(axis=0), 0.5 * np.ptp(plant.box_ends, axis=0)
     if not np.isfinite(half).all() or exact.rank(plant.box) < plant.n:
         return math.nan
     widths = plant.half_widths

@@ -11,8 +11,8 @@ from ncs_gym import ChannelContract, LinearPlant
 from ncs_gym.estimation.error_bound import unseen_state
 from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age
 from ncs_gym.estimation.error_sets import ErrorSetError
-from ncs_gym.limits import FREE_REACH
 from ncs_gym.plants.description import row_limit
+from ncs_gym.plants.hard_bounds import FREE_REACH
 from shields.errors import Infeasible
 from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.search import Progress

@@ -211,8 +211,8 @@ def share_of_last_input(polytope: Polytope, plant: LinearPlant) -> float | None:
         return None
     m, axes = plant.m, np.eye(plant.n)[-plant.m :]
     ends = polytope.support(np.concatenate([axes, -axes]))
-    least, most = np.maximum(-ends[m:], plant.input_low), np.minimum(ends[:m], plant.input_high)
-    return float(((most - least) / (plant.input_high - plant.input_low)).min())
+    least, most = np.maximum(-ends[m:], plant.input_ends[0]), np.minimum(ends[:m], plant.input_ends[1])
+    return float(((most - least) / np.ptp(plant.input_ends, axis=0)).min())
 
 
 def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
@@ -322,9 +322,9 @@ class _ClosedLoop:
         """
         plant, (x_c, u_c) = self.plant, self.rest
         reached = plant.box @ x_c
-        box = in_half_ranges(plant.box, plant.box_low - reached, plant.box_high - reached)
+        box = in_half_ranges(plant.box, *(plant.box_ends - reached))
         taken = plant.input_half * (float(ACTION_ROUNDING) + self._margin) + self._reach(self._K)
-        low, high = plant.input_low - u_c + taken, plant.input_high - u_c - taken
+        low, high = plant.input_ends[0] - u_c + taken, plant.input_ends[1] - u_c - taken
         if ((low >= 0.0) | (high <= 0.0)).any():
             raise _none("the error of the estimate alone takes an input beyond its limit; better sensors leave room")
         inputs, within = in_half_ranges(self._K, low, high), limits_within_step(self._feedback, plant)
@@ -370,7 +370,7 @@ class _ClosedLoop:
             np.where(np.isfinite(ends), exact.rounded(np.where(np.isfinite(ends), ends, 0.0), _DIGITS) + reached, ends)
             for ends in (faces.low, faces.high)
         )
-        own = Faces(plant.box, plant.box_low, plant.box_high)
+        own = Faces(plant.box, *plant.box_ends)
         return own.followed_by(Faces(rows, low, high).some(slice(count, None)))
 
     def multipliers(self, faces: Faces) -> tuple[np.ndarray, np.ndarray]:

@@ -67,7 +67,7 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     for i, (gain, limit) in enumerate(zip(K, half, strict=True)):
         rho = limit * root_above(max(error[i][i] for error in errors) / limit**2) + ACTION_ROUNDING * limit
         u_c = Fraction(float(certificate.resting_input[i]))
-        low, high = (Fraction(float(end[i])) - u_c for end in (plant.input_low, plant.input_high))
+        low, high = (Fraction(float(end[i])) - u_c for end in plant.input_ends)
         left = faces.left_of(gain, len(rows) + i, low, high) - rho
         yield scalar_condition(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
     yield from _mixed_conditions(faces, certificate, plant, images)

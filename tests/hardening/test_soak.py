@@ -8,7 +8,6 @@ import pytest
 from ncs_gym import Channel, Estimator, NCSEnv, Packet, certified_error_set
 from ncs_gym.estimation import arrival_histories
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, histories_of
-from ncs_gym.estimation.estimator import Estimate
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from tests.product import loop_env, vector_env
 from tests.shields.attacks.adversary import Traffic
@@ -72,11 +71,11 @@ def run_estimators(plant, count, episodes):
         for u, arrived in told[e]:
             fresh.advance(u, arrived)
             packets += len(arrived)
-        np.testing.assert_array_equal(shapes[e], fresh.estimate.shape)
-        np.testing.assert_allclose(vector.mean[:, e], fresh.estimate.mean, rtol=0.0, atol=1e-12)
+        np.testing.assert_array_equal(shapes[e], fresh.shape)
+        np.testing.assert_allclose(vector.mean[:, e], fresh.mean, rtol=0.0, atol=1e-12)
         assert (vector.age[e], vector.alarm[e]) == (fresh.age, fresh.alarm)
-        for name in Estimate._fields if e == 0 else ():
-            np.testing.assert_array_equal(getattr(single.estimate, name), getattr(fresh.estimate, name), err_msg=name)
+        for name in ("mean", "covariance", "shape", "age") if e == 0 else ():
+            np.testing.assert_array_equal(getattr(single, name), getattr(fresh, name), err_msg=name)
     assert packets > 10 * len(WATCHED)
 
 

@@ -84,7 +84,7 @@ def test_arrays_of_sets_cannot_be_written_to():
     ("make", "message"),
     [
         (lambda: Box([0.0, 1.0], [1.0]), "vectors of one size"),
-        (lambda: Box(1.0, 0.0), "half-widths of a box must be 0 or from"),
+        (lambda: Box(1.0, 0.0), "a box needs two finite ends, low <= high"),
         (lambda: Box([0.0], [np.inf]), "two finite ends"),
         (lambda: as_set(np.inf), "two finite ends"),
         (lambda: Ball(-1.0), "the radius of a ball must be a number >= 0"),

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from ncs_gym import (
     Bounds,
@@ -106,29 +107,33 @@ def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
     ("make", "message"),
     [
         (lambda: LinearPlant(MODEL, LIMITS, 0.1), "bounds must be a Bounds"),
-        (lambda: LinearPlant(MODEL, Limits([1.0], 1.0), BOUNDS), "state limits must be a pair"),
+        (lambda: LinearPlant(MODEL, Limits([1.0], 1.0), BOUNDS), r"state limits must be \(low, high\)"),
         (lambda: LinearPlant(MODEL, LIMITS, Bounds([0.1] * 3, 0.1, 0.1)), r"Bounds\(disturbance=...\)"),
         (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"outputs": {}}), 'labels must be {"states": {name: unit'),
-        (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"states": ["x", "y"]}), "a dictionary of names"),
-        (lambda: LinearPlant(ABOUT, LIMITS, BOUNDS), "state limits are absolute beside at="),
-        (lambda: LinearPlant(MODEL, Limits((-1.0, 5.0), 1.0), BOUNDS), "positive half-widths of shape"),
+        (lambda: LinearPlant(MODEL, LIMITS, BOUNDS, {"states": ["x", "y"]}), "labels must be"),
+        (lambda: LinearPlant(ABOUT, LIMITS, BOUNDS), "as beside at= of a Model, where"),
+        (lambda: LinearPlant(MODEL, Limits((-1.0, 5.0), 1.0), BOUNDS), "positive half-widths"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], (0.0, 5.0)), BOUNDS), "limits are absolute"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], (-np.inf, 5.0)), BOUNDS), "input limits must be finite"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], 1.0, [([0.0, 1.0], [0.0], -1.0, 1.0)]), BOUNDS), "something"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], 1.0, between_samples=4), BOUNDS), "between_samples needs"),
-        (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], np.inf), BOUNDS), "not all infinite"),
+        (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], np.inf), BOUNDS), "must be finite"),
         (lambda: LinearPlant(MODEL, Limits([(-1, 1), (-2, 2)], 1.0), BOUNDS), "all low ends, then all high ones"),
         (lambda: Limits([1.0, 2.0]), "need input="),
         (lambda: Limits(input=1.0, rows=[([1.0], -1.0, 1.0)]), "rows of limits must be a list"),
         (lambda: Model(A, B, [[0.0, 0.0]], 0.1), "every row of H"),
         (lambda: Model(A, B, None, 0.1, at=3.0), "at must be a pair"),
+        (lambda: Model(csr_array(A), B, None, 0.1), "A must be a matrix of numbers"),
         (lambda: Model(A, B, None, 0.1, at=[0.5, 0.0]), r"the state in at=\(state, input\) must have shape"),
         (lambda: Model(A, B, None, 0.1, continuous=A), "^continuous must have shape"),
         (lambda: Model.sampled(A, B, [[1.0]], 0.1), "^C must have shape"),
         (lambda: Model.of(A, 0.1), "^the system must be a state-space model"),
         (lambda: MODEL.held(np.eye(2)), "in continuous time"),
         (lambda: linear_model(np.add, Limits(input=1.0), BOUNDS, 0.1), r"give Limits\(state=...\)"),
-        (lambda: linear_model(np.add, Limits((-1.0, 1.0), (0.0, 8.0)), BOUNDS, 0.1), r"give at=\(state, input\)"),
+        (
+            lambda: linear_model(np.add, Limits((-1.0, 1.0), (0.0, 8.0)), BOUNDS, 0.1),
+            r"at=\(state, input\) of the Model",
+        ),
         (lambda: MODEL.with_delays(-1), "delays must be a whole number"),
         (
             lambda: LinearPlant(MODEL, LIMITS, Bounds(Gaussian(np.eye(2), 0.1), Gaussian(np.eye(2), 0.2), 0.0)),

@@ -34,8 +34,8 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     if not fits:
         return
     leads = r >= k and all(a == b for a, b in zip(polytope.rows[:k].ravel(), plant.box.ravel(), strict=True))
-    leads = leads and polytope.low[:k].tolist() == plant.box_low.tolist()
-    leads = leads and polytope.high[:k].tolist() == plant.box_high.tolist()
+    leads = leads and polytope.low[:k].tolist() == plant.box_ends[0].tolist()
+    leads = leads and polytope.high[:k].tolist() == plant.box_ends[1].tolist()
     yield is_so("polytope: its first rows are those of the safe box", leads)
     if not leads:
         return

@@ -122,7 +122,7 @@ def test_range_is_that_of_a_linear_program_in_states_and_inputs(name):
             "b_ub": sides[1][np.isfinite(sides[1])],
             "A_eq": np.hstack([plant.A - np.eye(plant.n), plant.B]),
             "b_eq": np.zeros(plant.n),
-            "bounds": [(None, None)] * plant.n + list(zip(plant.input_low, plant.input_high, strict=True)),
+            "bounds": [(None, None)] * plant.n + plant.input_ends.T.tolist(),
         }
         row = np.arange(1.0, plant.n + 1.0)
         expected = [sign * linprog(sign * np.append(row, np.zeros(plant.m)), **program).fun for sign in (1.0, -1.0)]

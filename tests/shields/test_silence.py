@@ -101,11 +101,11 @@ def extremes(plant, certificate, age, steps, share=None):
 
 
 def keeps_box(plant, values, slack):
-    return np.all(plant.box_low - slack <= values[0]) and np.all(values[1] <= plant.box_high + slack)
+    return np.all(plant.box_ends[0] - slack <= values[0]) and np.all(values[1] <= plant.box_ends[1] + slack)
 
 
 def exceeds_limits(plant, values):
-    return np.any(values[0] < plant.input_low) or np.any(values[1] > plant.input_high)
+    return np.any(values[0] < plant.input_ends[0]) or np.any(values[1] > plant.input_ends[1])
 
 
 @pytest.mark.cases(3)

@@ -133,7 +133,7 @@ class PlanTest:
         kept &= on_the_way
         if tightening.between.size:
             kept &= prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
-        within = np.all((plant.input_low <= plans) & (plans <= plant.input_high), axis=-1)
+        within = np.all((plant.input_ends[0] <= plans) & (plans <= plant.input_ends[1]), axis=-1)
         return np.logical_and.accumulate(within, axis=-1) & kept.transpose(1, 2, 0)
 
     def _between(self, estimates: np.ndarray, tightening: Tightening, centers: np.ndarray, rows: slice) -> np.ndarray:

@@ -415,7 +415,7 @@ def completed(
     for j in range(steps):
         u = plans[j]
         if some[j]:
-            gained = np.minimum(np.maximum(centers @ turned + constants, plant.input_low), plant.input_high)
+            gained = np.minimum(np.maximum(centers @ turned + constants, plant.input_ends[0]), plant.input_ends[1])
             u = plans[j] = gained if every[j] else np.where(missing[j], gained, u)
         if j + 1 < steps:
             centers = centers @ A + u @ B

@@ -153,7 +153,7 @@ class Lookahead:
         if numbers is None or numbers.ndim != 2 or numbers.shape[1] != plant.m or len(numbers) > len(stored):
             return stored
         numbers = numbers.copy()  # read once
-        if ((plant.input_low <= numbers) & (numbers <= plant.input_high)).all():
+        if ((plant.input_ends[0] <= numbers) & (numbers <= plant.input_ends[1])).all():
             stored[: len(numbers)] = numbers
         return stored
 
@@ -161,7 +161,7 @@ class Lookahead:
         """Returns plans, shape (N, horizon, m), NaN beyond their ends; all NaN for those that are none."""
         plant = self._test.plant
         given: np.ndarray = np.asarray(~np.isnan(plans).all(axis=2))
-        within = ((plant.input_low <= plans) & (plans <= plant.input_high)).all(axis=2)
+        within = ((plant.input_ends[0] <= plans) & (plans <= plant.input_ends[1])).all(axis=2)
         goes_on = given[:, :-1] | ~given[:, 1:]
         is_plan = np.all(given == within, axis=1) & np.all(goes_on, axis=1)
         return np.where(np.reshape(is_plan, (-1, 1, 1)), plans, np.nan)

@@ -187,14 +187,14 @@ def test_actions_stand_for_inputs_between_both_ends(name):
     plant, estimates = (env := two_ended()).plant, np.random.default_rng(0).uniform(-9.0, 9.0, (400, 2))
     fallback = Fallback(np.array([[-0.8, -0.3]]), np.array([0.5, 0.25]), np.array([0.125]))
     u = inputs_of(plant, controller(name, env, fallback, 0)(estimates, {"estimate": estimates}))
-    assert ((plant.input_low - 1e-12 <= u) & (u <= plant.input_high + 1e-12)).all()
+    assert ((plant.input_ends[0] - 1e-12 <= u) & (u <= plant.input_ends[1] + 1e-12)).all()
     if name == "zero input":
         np.testing.assert_allclose(u, 0.0, atol=1e-12)
     else:
         np.testing.assert_allclose([u.min(), u.max()], plant.input_ends[:, 0], atol=0.1)
     if name == "K x_hat":
         wanted = 0.125 + (estimates - [0.5, 0.25]) @ fallback.gain.T
-        np.testing.assert_allclose(u, np.clip(wanted, plant.input_low, plant.input_high), atol=1e-12)
+        np.testing.assert_allclose(u, np.clip(wanted, *plant.input_ends), atol=1e-12)
 
 
 @pytest.mark.cases(2)

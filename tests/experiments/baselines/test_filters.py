@@ -160,7 +160,7 @@ def test_predictive_filter_keeps_limits_with_two_ends_and_of_states_and_inputs_t
         if k % 20 == 0:
             proposed = np.where(rng.random(plant.m) < 0.5, *plant.input_ends)
         u = predictive(state[None], proposed[None], np.array([k == 0]))[0]
-        assert ((plant.input_low <= u) & (u <= plant.input_high)).all()
+        assert ((plant.input_ends[0] <= u) & (u <= plant.input_ends[1])).all()
         after = plant.A @ state + plant.B @ u
         reached.append(plant.worst_constraint_values(state, u, after).max())
         state, raw = after, plant.A @ raw + plant.B @ proposed

@@ -180,7 +180,7 @@ def test_environments_that_share_a_graph_do_not_notice_each_other(kind, most, mo
     wanted = list(steps_of(alone, 120))
     monkeypatch.setattr(arrival_histories, "_shared", {})
     envs = [KINDS[kind](), KINDS["scalar"](), KINDS["vector"]()]
-    graphs = {id(env._now.estimator._histories) for env in envs[:2] if kind == "scalar"}
+    graphs = {id(env._now.estimator.histories) for env in envs[:2] if kind == "scalar"}
     assert len(graphs) <= 1
     for seed, env in enumerate(envs, 1):
         env.reset(seed=seed)
@@ -247,7 +247,7 @@ def test_graphs_of_long_buffers_and_large_plants_hold_fewer_histories(plant, cha
         for _ in range(400):
             env.step(action)
             sizes.append(tracemalloc.get_traced_memory()[0] - before)
-            graphs.add(id(env._now.estimator._histories))
+            graphs.add(id(env._now.estimator.histories))
     finally:
         tracemalloc.stop()
     assert len(graphs) > 1
@@ -264,7 +264,7 @@ def test_graphs_that_nobody_uses_any_more_are_freed(monkeypatch):
         graphs.add(env._now.estimator.histories)
     gc.collect()
     assert len(graphs) <= 3
-    assert env.single._now.estimator._histories is not env._now.estimator.histories
+    assert env.single._now.estimator.histories is not env._now.estimator.histories
 
 
 def test_graphs_of_many_plants_are_not_kept_for_ever(monkeypatch):

@@ -5,7 +5,7 @@ import pytest
 
 from ncs_gym import Ellipsoid, ErrorSetError, UnstablePlantError, certified_error_set, truck_trailer
 from ncs_gym.estimation.error_bound import require_error_set
-from ncs_gym.estimation.error_sets import InvariantErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.plants import random_plant
 from tests.product import library_plant, linear_plant
@@ -105,7 +105,7 @@ def test_set_that_holds_by_no_more_than_rounding_is_an_error(growth):
     settings = {"disturbance_bound": 0.1, "sensor_bound": 0.1, "initial_bound": 0.0}
     plant = linear_plant(A=[[0.5]], B=[[1.0]], box=[1.0], u_max=1.0, dt=0.1, **settings)
     Sigma = growth * 4.0 * plant.disturbance.shape_matrix
-    errors = InvariantErrorSet(Sigma=Sigma, rate=0.5)
+    errors = ErrorSet(shapes=np.array([Sigma]), rates=np.array([0.5]))
     if growth > 1.0 + 1e-12:
         require_error_set(errors, plant)
     else:
@@ -122,7 +122,7 @@ def test_set_that_fails_a_condition_in_one_direction_is_an_error():
         plant = linear_plant(
             A=0.5 * np.eye(2), B=np.eye(2), box=1.0, u_max=1.0, dt=0.1, initial_bound=initial, **bounds
         )
-        require_error_set(InvariantErrorSet(Sigma=Sigma, rate=0.5), plant)
+        require_error_set(ErrorSet(shapes=np.array([Sigma]), rates=np.array([0.5])), plant)
 
     check(4.01 * np.eye(2), [2.0, 1.0])
     with pytest.raises(ErrorSetError, match=r"\(E1\)"):

@@ -19,7 +19,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.estimation.arrival_histories import histories_of
-from ncs_gym.estimation.error_sets import InvariantErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.innovation import quick_test
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, predicted_covariance, updated_covariance
 from ncs_gym.estimation.set_membership import SetMembership, enlarged_by_rounding
@@ -37,7 +37,7 @@ FINE = {"covariance_bits": 45, "shape_step": 2.0**-45}
 def roomy(plant, factor=1e4):
     """An error set so large that the guard accepts every Kalman update."""
     errors = certified_error_set(plant)
-    return InvariantErrorSet(Sigma=factor * errors.Sigma, rate=errors.rate)
+    return ErrorSet(shapes=np.array([factor * errors.Sigma]), rates=np.array([errors.rate]))
 
 
 def sets_of(plant, channel=None):
@@ -90,8 +90,8 @@ def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(see
         estimator.advance(inputs[-1], packets)
         noise_cov = plant.measurement_noise_cov + 0.001**2 / 12 * np.eye(plant.p)
         mean, covariance = batch_estimate(plant, first, inputs, used, noise_cov)
-        np.testing.assert_allclose(estimator.estimate.mean, mean, atol=1e-9)
-        np.testing.assert_allclose(estimator.estimate.covariance, covariance, atol=1e-10)
+        np.testing.assert_allclose(estimator.mean, mean, atol=1e-9)
+        np.testing.assert_allclose(estimator.covariance, covariance, atol=1e-10)
 
 
 def test_episodes_are_counted_from_the_first_one_on():
@@ -120,7 +120,7 @@ def drive(plant, channel, seed, steps, push):
     link = ChannelState(channel, rng)
     for step in range(1, steps + 1):
         u = rng.uniform(-1, 1, plant.m) * plant.u_max
-        e = estimator.estimate.mean - x
+        e = estimator.mean - x
         d = -plant.disturbance.farthest_point(plant.A @ e, push(rng)) * (1 - 1e-12)
         x = plant.A @ x + plant.B @ u + d
         sample = plant.H @ x + worst_noise(rng, plant) if link.sends_at(step) else None
@@ -148,8 +148,8 @@ def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, s
     Sigma = certified_error_set(plant).Sigma
     largest = 0.0
     for estimator, x in drive(plant, channel, seed, 100, push):
-        shape = estimator.estimate.shape
-        largest = max(largest, Ellipsoid(shape).gauge(estimator.estimate.mean - x))
+        shape = estimator.shape
+        largest = max(largest, Ellipsoid(shape).gauge(estimator.mean - x))
         assert np.linalg.eigvalsh(Sigma - shape)[0] >= -1e-15
         assert not estimator.alarm
     assert 0.5 < largest <= 1.0
@@ -174,10 +174,10 @@ def test_samples_are_used_however_wide_the_box_of_another_state_is(current, chan
     )  # fmt: skip
     Sigma, ages, speeds, gauges = certified_error_set(plant).Sigma, [], [], []
     for estimator, x in drive(plant, channel, 0, 300, lambda rng: np.diag(rng.uniform(0.0, 1.0, 2))):
-        shape = estimator.estimate.shape
+        shape = estimator.shape
         ages.append(estimator.age)
         speeds.append(np.sqrt(shape[0, 0]))
-        gauges.append(Ellipsoid(shape).gauge(estimator.estimate.mean - x))
+        gauges.append(Ellipsoid(shape).gauge(estimator.mean - x))
         assert np.linalg.eigvalsh(Sigma - shape)[0] >= -1e-15
         assert not estimator.alarm
     assert 0.5 < max(gauges) <= 1.0
@@ -195,7 +195,7 @@ def test_an_update_may_enlarge_what_later_steps_shrink():
     estimator.reset(np.zeros(2))
     for step in range(1, 201):
         estimator.advance(np.zeros(1), [Packet(step - 1, np.zeros(1))] if step > 1 else [])
-        traces.append(np.vdot(plant.weight, estimator.estimate.shape))
+        traces.append(np.vdot(plant.weight, estimator.shape))
         assert estimator.age == 1
     assert np.mean(traces[100:]) < 0.05 * np.vdot(plant.weight, certified_error_set(plant).Sigma)
 
@@ -213,7 +213,7 @@ def test_under_a_contract_the_certified_gain_comes_before_the_way_back_so_that_s
 def test_updates_shrink_the_running_ellipsoid():
     plant = truck_trailer(mass=4000.0)
     Sigma = certified_error_set(plant).Sigma
-    ends = [estimator.estimate.shape for estimator, _ in drive(plant, Channel(), 0, 200, lambda rng: np.eye(2))]
+    ends = [estimator.shape for estimator, _ in drive(plant, Channel(), 0, 200, lambda rng: np.eye(2))]
     assert np.trace(ends[-1]) < 0.3 * np.trace(Sigma)
 
 
@@ -233,7 +233,7 @@ def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     plant = truck_trailer()
     prior = Estimator(plant, Channel())
     prior.advance(np.zeros(1), [])
-    spread = Ellipsoid(plant.H @ prior.estimate.shape @ plant.H.T)
+    spread = Ellipsoid(plant.H @ prior.shape @ plant.H.T)
     direction = np.array([1.0, 0.3])
     noise = Ellipsoid(sets_of(plant).noise)
     edge = spread.extreme_point(direction) + noise.extreme_point(direction)
@@ -241,7 +241,7 @@ def test_innovation_at_the_edge_of_both_bounds_is_no_alarm():
     assert not naive.contains(edge)
     for residual, alarm in ((edge, False), (1.001 * edge, True)):
         estimator = Estimator(plant, Channel())
-        estimator.advance(np.zeros(1), [Packet(1, plant.H @ prior.estimate.mean + residual)])
+        estimator.advance(np.zeros(1), [Packet(1, plant.H @ prior.mean + residual)])
         assert estimator.alarm is alarm
 
 
@@ -257,7 +257,7 @@ def test_a_packet_never_leaves_a_larger_ellipsoid_than_ignoring_it(seed):
         ignoring = copy.deepcopy(estimator)
         estimator.advance(u, [Packet(stamp, np.zeros(1))])
         ignoring.advance(u, [])
-        assert np.vdot(plant.weight, estimator.estimate.shape) <= np.vdot(plant.weight, ignoring.estimate.shape)
+        assert np.vdot(plant.weight, estimator.shape) <= np.vdot(plant.weight, ignoring.shape)
 
 
 def test_computed_shapes_hold_the_exact_ones():
@@ -292,7 +292,9 @@ def test_a_shape_outside_the_certified_one_of_its_age_is_not_brought_back_by_a_p
 def test_a_long_thin_shape_is_moved_without_loss(size):
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
     plant = linear_plant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
-    sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=1e2 * np.eye(2), rate=0.9), shape_step=2.0**-90)
+    sets = SetMembership(
+        plant, 0.0, ErrorSet(shapes=np.array([1e2 * np.eye(2)]), rates=np.array([0.9])), shape_step=2.0**-90
+    )
     rng = np.random.default_rng(0)
     for _ in range(60):
         long = (size * rng.uniform(0.5, 1.0)) ** 2 * np.array([[1.0, 2.0], [2.0, 4.0]])  # which A annihilates
@@ -304,7 +306,7 @@ def test_a_long_thin_shape_is_moved_without_loss(size):
 def test_a_shape_that_outgrows_the_states_themselves_becomes_one_around_all_their_differences():
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "sensor_bound": 0.0, "initial_bound": 0.0}
     plant = linear_plant(A=np.diag([1.5, 1.1]), B=np.ones((2, 1)), box=[1.0, 3.0], **settings)
-    sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=np.eye(2), rate=0.5))
+    sets = SetMembership(plant, 0.0, ErrorSet(shapes=np.array([np.eye(2)]), rates=np.array([0.5])))
     farthest = 2.0 * plant.state_limit  # between states at opposite ends of where a simulation stops them
     for grown in (np.diag([9.0 * farthest[0] ** 2, 1.0]), np.diag([1.0, 9.0 * farthest[1] ** 2])):
         shape = sets.predicted(grown, 0)
@@ -320,7 +322,7 @@ def test_rounded_shapes_are_no_smaller_where_the_certified_set_is_ill_conditione
     n, rng = 44, np.random.default_rng(0)
     factor = np.eye(n) - np.tril(np.ones((n, n)), -1)
     plant = linear_plant(A=0.5 * np.eye(n), B=np.ones((n, 1)), box=np.eye(n), u_max=1.0, dt=0.1, gamma=1e-6)
-    sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=factor @ factor.T, rate=0.5))
+    sets = SetMembership(plant, 0.0, ErrorSet(shapes=np.array([factor @ factor.T]), rates=np.array([0.5])))
     for root in rng.standard_normal((8, n, n)):
         shape = size * factor @ root @ root.T @ factor.T
         shape = 0.5 * (shape + shape.T)
@@ -358,7 +360,7 @@ def test_covariances_and_gains_are_those_of_filterpy(plant):
     estimator = Estimator(plant, Channel(quantization_step=0.01), certified_error_set(plant, ChannelContract(3, 0.01)))
     estimator.reset(0.01 * np.ones(plant.n))
     u, y, theirs = 0.1 * plant.u_max, 0.02 * np.ones(plant.p), estimator.as_filterpy()
-    P = estimator.estimate.covariance
+    P = estimator.covariance
     theirs.predict(u)
     estimator.advance(u, [])
     np.testing.assert_allclose(theirs.x, estimator.mean, rtol=1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, certified_error_set
-from ncs_gym.estimation.error_sets import ErrorSetsByAge, InvariantErrorSet
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.plants.hard_bounds import INFLATION, SIMULATED_REACH
@@ -18,6 +18,7 @@ from tests.product import altered, linear_plant
 RADIUS, GAIN, RATE = 1e-8, 0.9, 1.02
 # By how much all conditions hold, so that evaluating them in float64 shows it.
 SLACK = 1e-12
+UNIT = ErrorSet(shapes=np.ones((1, 1, 1)), rates=np.array([0.5]))
 
 
 def plant_with(sensor_radius):
@@ -35,7 +36,7 @@ def plant_with(sensor_radius):
 
 def sets_for_age_zero(plant, newest, older, rate, gain, mu, noise=None):
     """Sets of one state for samples that are never late."""
-    sets = ErrorSetsByAge(
+    sets = ErrorSet(
         contract=ChannelContract(0),
         shapes=np.array([[[newest]], [[older]]]),
         rates=np.array([rate]),
@@ -103,7 +104,7 @@ def test_with_room_an_updated_estimate_stays_in_its_set():
 def test_a_gain_chosen_at_run_time_has_the_room_where_shapes_are_hardly_rounded_up(radius, gain):
     """The inflation covers what rounding takes of a large error, and what the plant adds that of a small one."""
     plant, rng, largest, H = altered(plant_with(radius), H=np.array([[0.9]])), np.random.default_rng(0), 0.0, 0.9
-    sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
+    sets = SetMembership(plant, 0.0, UNIT, shape_step=2.0**-90)
     error, noise = Fraction(radius), Fraction(float(sets.noise[0, 0] ** 0.5)) * (1 - Fraction(1, 10**15))
     limit = sets.updated(np.array([[radius**2]]), np.array([[gain]])).item() ** 0.5
     for _ in range(500):
@@ -123,7 +124,7 @@ def test_an_update_holds_noise_that_is_nearly_common_to_two_sensors():
         noise = Ellipsoid(1e4 * rng.uniform(0.5, 1.0) * np.array([[1.0, 0.7], [0.7, 0.49]]) + 1e-12 * np.eye(2))
         settings = {"disturbance_bound": 0.0, "sensor_bound": noise, "initial_bound": 0.0}
         plant = linear_plant(A=[[RATE]], B=[[1.0]], H=[[1.0], [0.7]], box=[1.0], u_max=1.0, dt=0.1, **settings)
-        sets = SetMembership(plant, 0.0, InvariantErrorSet(Sigma=np.array([[1.0]]), rate=0.5), shape_step=2.0**-90)
+        sets = SetMembership(plant, 0.0, UNIT, shape_step=2.0**-90)
         gain, shape = np.array([[70.0, -100.0]]) * rng.uniform(0.5, 1.0), np.array([[1e-26]])
         N = congruence(rational(gain), rational(sets.noise))
         assert sets.updated(shape, gain).item() >= N[0][0]

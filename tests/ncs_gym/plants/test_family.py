@@ -78,7 +78,7 @@ def between(function, ranges, count, seed=0):
 def test_bound_holds_every_member_exactly_and_is_not_far_larger(plant, members, widths):
     gauge = largest_gauge(plant, members, widths)
     assert 0.4 < gauge <= 1
-    assert plant.remainder.is_proved
+    assert plant.remainder.proved
 
 
 def test_members_inside_the_hull_leave_out_less_than_its_vertices():
@@ -429,7 +429,7 @@ LEFT_OUT = Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example")
 REFUSED = {
     "nothing between the ends": (lambda: family_of(truck_trailer, MASSES), "say monotone=True if"),
     "no ranges": (lambda: family_of(truck_trailer), "ranges must be a dictionary of 1 to 6"),
-    "no range": (lambda: family_of(truck_trailer, {"mass": 4000.0}, monotone=True), "must be a pair"),
+    "no range": (lambda: family_of(truck_trailer, {"mass": 4000.0}, monotone=True), r"must be \(low, high\)"),
     "ends": (lambda: family_of(truck_trailer, {"mass": (4.0, 3.0)}, monotone=True), "low < high"),
     "ranges of plants": (lambda: family_of(TRUCKS, MASSES), "about a function"),
     "one plant": (lambda: family_of(TRUCKS[:1]), "two plants or more"),
@@ -438,8 +438,8 @@ REFUSED = {
     "another box": (lambda: family_of(two(box=[1.0, 1.0])), "member 1 differs in Limits of states"),
     "another noise": (lambda: family_of(two(disturbance_bound=0.1)), r"differs in Bounds\(disturbance=...\)"),
     "a step": (lambda: family_of(truck_trailer, {"dt": (0.4, 0.5)}, monotone=True), "differs in dt"),
-    "a remainder": (lambda: family_of(two(remainder=LEFT_OUT)), "a remainder of its own"),
-    "between samples": (lambda: family_of([SAMPLED, SAMPLED]), "between_samples is not proved for a family"),
+    "a remainder": (lambda: family_of(two(remainder=LEFT_OUT)), "without a remainder of their own"),
+    "between samples": (lambda: family_of([SAMPLED, SAMPLED]), "without between_samples"),
     "between samples later": (lambda: altered(HULL, between_samples=4), "between_samples"),
     "rates later": (
         lambda: rate_limited(family_of(two(B=[[0.0], [0.4]])), 0.5),

@@ -47,11 +47,11 @@ def gauges(plant, step, count=500):
 def test_remainder_lies_in_its_bound_and_says_how_that_is_known(jacobian_bounds):
     plant = model(jacobian_bounds=jacobian_bounds)
     assert gauges(plant, swing).max() <= 1.0
-    assert plant.remainder.is_proved == (jacobian_bounds is not None)
-    words = "is bounded by proof" if plant.remainder.is_proved else "is assumed to lie in its bound"
+    assert plant.remainder.proved == (jacobian_bounds is not None)
+    words = "is bounded by proof" if plant.remainder.proved else "is assumed to lie in its bound"
     (sentence,) = (each for each in plant.assumptions if "linear model" in each)
     assert words in sentence
-    assert ("bounds on its Jacobian" if plant.remainder.is_proved else "safety factor 1.25") in sentence
+    assert ("bounds on its Jacobian" if plant.remainder.proved else "safety factor 1.25") in sentence
 
 
 def test_sampled_bound_is_tight_and_grows_with_the_safety_factor():
@@ -86,7 +86,7 @@ def test_proved_bound_holds_what_a_step_from_rest_leaves_out(offset):
 
     bounds = [[0.4, 0.3]], [[0.6, 0.3]]
     plant = linear_model(kinked, [0.5], [1.0], 0.1, jacobian_bounds=bounds, samples=200, **QUIET)
-    assert plant.remainder.is_proved
+    assert plant.remainder.proved
     np.testing.assert_allclose(np.sqrt(plant.remainder.bound.shape_matrix), [[0.05 + abs(offset)]], rtol=1e-6)
 
 
@@ -234,7 +234,7 @@ def test_inner_environment_is_modeled_like_its_equations():
 def test_pendulum_is_proved_by_another_route():
     """Not sin(angle) / angle but the extremes of the remainder, which lie at the ends or where the slope is its own."""
     plant = pendulum()
-    assert plant.remainder.is_proved
+    assert plant.remainder.proved
     slope = plant.A[1, 0] / PULL
     angles = np.array([0.25, np.arccos(slope)])
     largest = PULL * np.abs(np.sin(angles) - slope * angles).max() + 0.15 * TORQUE * 3.0 * 2.0**-24  # what rounds

@@ -65,7 +65,7 @@ def test_linear_model_is_that_of_the_process_and_spec_is_json(env_id):
     env = made(env_id)
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.unwrapped.plant.fingerprint == env.unwrapped.plant.fingerprint
-    assert env.unwrapped.plant.remainder.is_proved == (env_id == "ncs_gym/Pendulum-v0")
+    assert env.unwrapped.plant.remainder.proved == (env_id == "ncs_gym/Pendulum-v0")
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_declared_model_is_the_one_that_sampling_finds(declared, sampled, needs)
     if needs:
         pytest.importorskip(needs)
     plant, again = declared(), sampled()
-    assert plant.remainder.is_proved is again.remainder.is_proved is False
+    assert plant.remainder.proved is again.remainder.proved is False
     widths = plant.half_widths
     np.testing.assert_allclose(plant.A * widths / widths[:, None], again.A * widths / widths[:, None], atol=1e-6)
     np.testing.assert_allclose(plant.B / widths[:, None], again.B / widths[:, None], atol=1e-6)

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from ncs_gym import Ellipsoid
 from ncs_gym.estimation.innovation import outside_sum
-from ncs_gym.uncertainty.ellipsoid import farthest_coordinates, sum_gauge
+from ncs_gym.uncertainty.ellipsoid import farthest_coordinates
 from ncs_gym.uncertainty.shape_matrices import is_inside, joined, outer_sum
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 
@@ -124,9 +124,11 @@ def test_membership_in_a_sum_agrees_with_searching_for_the_two_parts_and_is_exac
         first, second = Ellipsoid(random_shape(rng, size)), Ellipsoid(random_shape(rng, size))
         direction = rng.standard_normal(size)
         boundary = first.extreme_point(direction) + second.extreme_point(direction)
-        assert sum_gauge(boundary, first.shape_matrix, second.shape_matrix) == pytest.approx(1.0, abs=1e-7)
+        shapes = first.shape_matrix, second.shape_matrix
+        assert not outside_sum(boundary[None], *shapes, 1e-7).any()
+        assert outside_sum(boundary[None], *shapes, -1e-7).all()
         for factor, inside in ((0.98, True), (1.02, False)):
-            assert (sum_gauge(factor * boundary, first.shape_matrix, second.shape_matrix) <= 1.0) is inside
+            assert outside_sum(factor * boundary[None], *shapes, 0.0).item() is not inside
             assert size == 3 or (distance_to_sum(factor * boundary, first, second) <= 1.0) == inside
 
 
@@ -211,6 +213,19 @@ def test_joined_ellipsoid_holds_both_and_touches_each(n):
         assert n == 1 or values.max() == pytest.approx(1.0)
     flat = np.zeros((n, n))
     np.testing.assert_allclose(joined(first, flat), first)
+
+
+def sum_gauge(point, first, second):
+    """sqrt(max over nu of r'(P1/nu + P2/(1-nu))^-1 r), a concave function of nu."""
+    size = np.abs(np.diag(first)).max()
+    point, first, second = point / size**0.5, first / size, second / size
+    found = minimize_scalar(
+        lambda nu: -Ellipsoid(first / nu + second / (1.0 - nu)).gauge(point),
+        bounds=(1e-9, 1.0 - 1e-9),
+        method="bounded",
+        options={"xatol": 1e-9},
+    )
+    return -found.fun
 
 
 @pytest.mark.cases(3)

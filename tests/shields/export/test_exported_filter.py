@@ -113,7 +113,7 @@ def test_what_passes_on_a_board_passes_the_filter_with_the_error_set_of_its_age(
         direction = boundary(set_of(certificate), plant.half_widths, rng, 1)[:, 0]
         board = BoardFilter(table, 0, rng.uniform(0.5, 1.0) * direction)
         board.age = age = int(rng.integers(len(table.limit)))
-        estimate, wanted = board.estimate, rng.uniform(plant.input_low, plant.input_high)
+        estimate, wanted = board.estimate, rng.uniform(*plant.input_ends)
         decision, u = board.decide(wanted)
         if decision in (board_filter.SAFE, board_filter.PROJECTED):
             passed[age] += 1
@@ -142,7 +142,7 @@ def attacked(folder, name, steps, seed=0, count=200, outages=False):
             Adversary(seen, certificate, rng, count),
             Traffic(*((3 * h, None) if outages else (h, h)), count),
         )
-        adversary.safe, adversary.box = set_of(certificate), Ends.of(plant.box, plant.box_low, plant.box_high)
+        adversary.safe, adversary.box = set_of(certificate), Ends.of(plant.box, *plant.box_ends)
         x = boundary(adversary.safe, plant.half_widths, rng, count) * rng.uniform(0.5, 1.0, count)
         boards.start(episode, (x + plant.nominal_initial_error.sample_boundary(rng, count).T).T)
         taken = []

@@ -57,14 +57,14 @@ def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
         left = min((values - low).min(), (high - values).min())
         if abs(left) > 1e-7:
             assert (decision.reason == "safe") == (left > 0.0)
-        assert ((plant.input_low <= decision.input) & (decision.input <= plant.input_high)).all()
+        assert ((plant.input_ends[0] <= decision.input) & (decision.input <= plant.input_ends[1])).all()
         reasons.append(decision.reason)
         if decision.reason == "safe":
             continue
         u = cp.Variable(plant.m)
         c = rows[:, : plant.n] @ estimate + rows[:, plant.n :] @ u
         kept = [c[np.isfinite(high)] <= high[np.isfinite(high)], c[np.isfinite(low)] >= low[np.isfinite(low)]]
-        limits = [u <= plant.input_high, u >= plant.input_low]
+        limits = [u <= plant.input_ends[1], u >= plant.input_ends[0]]
         problem = cp.Problem(cp.Minimize(cp.sum_squares(u - proposed)), kept + limits)
         problem.solve(solver=cp.CLARABEL)
         if problem.status == cp.OPTIMAL and decision.reason == "projected":
@@ -72,7 +72,7 @@ def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
         elif problem.status == cp.INFEASIBLE:
             assert decision.reason == "fallback"
             wanted = found.resting_input + found.K @ (estimate - found.resting_state)
-            clipped = np.clip(wanted, plant.input_low, plant.input_high)
+            clipped = np.clip(wanted, *plant.input_ends)
             np.testing.assert_allclose(decision.input, clipped, atol=1e-6 * plant.input_half.max())
     assert "safe" in reasons
     assert ("fallback" if name == "hill" else "projected") in reasons  # a step moves little of the speed on a hill
@@ -102,7 +102,7 @@ def test_no_limit_is_passed_while_guaranteed(name, mode):
             values = info["state"] @ P.rows.T
             if mode != "lookahead":
                 assert ((P.low <= values) & (values <= P.high)).all()
-            assert ((plant.input_low <= info["input"]) & (info["input"] <= plant.input_high)).all()
+            assert ((plant.input_ends[0] <= info["input"]) & (info["input"] <= plant.input_ends[1])).all()
             intervened += info["shield_intervened"].sum()
             if len(plant.mixed_rows):
                 passed = mixed_values(plant, states, info["input"])

@@ -159,7 +159,7 @@ def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it(name):
     loop = safe_loop(found, plant, Channel(), mode="lookahead")
     loop.start(np.zeros(plant.n))
     loop.receive()
-    for proposed in (plant.input_high, plant.input_low):
+    for proposed in plant.input_ends[::-1]:
         decision = copy.deepcopy(loop).decide(proposed)
         assert decision.input == pytest.approx(0.3 * np.sign(proposed), abs=1e-3)
 

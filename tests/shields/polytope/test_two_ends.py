@@ -31,7 +31,7 @@ def test_polytope_has_the_plants_ends_and_its_rest_is_an_equilibrium(name):
     x, u = found.resting_state, found.resting_input
     np.testing.assert_allclose(plant.A @ x + plant.B @ u, x, atol=1e-9)
     assert (plant.constraint_values(x) < 0.0).all()
-    assert ((plant.input_low < u) & (u < plant.input_high)).all()
+    assert ((plant.input_ends[0] < u) & (u < plant.input_ends[1])).all()
     np.testing.assert_array_equal(P.center, x)
 
 
@@ -96,7 +96,7 @@ def test_share_of_the_last_input_is_what_linear_programs_find():
     found = synthesize(plant)
     P = found.polytope
     faces, ends = np.concatenate([P.rows, -P.rows]), np.concatenate([P.high, -P.low])
-    bounds = [*(plant.n - 1) * [(None, None)], (plant.input_low.item(), plant.input_high.item())]
+    bounds = [*(plant.n - 1) * [(None, None)], tuple(plant.input_ends[:, 0].tolist())]
     last = np.eye(plant.n)[-1]
     least, most = (
         linprog(sign * last, faces[np.isfinite(ends)], ends[np.isfinite(ends)], bounds=bounds) for sign in (1.0, -1.0)
@@ -162,7 +162,7 @@ def is_invariant(found, plant):
         rows += [g] * np.isfinite(high) + [-g] * np.isfinite(low)
         ends += [high] * np.isfinite(high) + [-low] * np.isfinite(low)
     k = len(plant.box)
-    if (P.low[:k] < plant.box_low).any() or (P.high[:k] > plant.box_high).any():
+    if (P.low[:k] < plant.box_ends[0]).any() or (P.high[:k] > plant.box_ends[1]).any():
         return False
     closed = plant.A + plant.B @ found.K
     constant = plant.B @ (found.resting_input - found.K @ found.resting_state)
@@ -178,8 +178,8 @@ def is_invariant(found, plant):
 
 def within_symmetric(plant):
     """The plant with the largest symmetric limits inside its own."""
-    rows = plant.box / np.minimum(-plant.box_low, plant.box_high)[:, None]
-    return altered(plant, box=rows, u_max=np.minimum(-plant.input_low, plant.input_high))
+    rows = plant.box / np.abs(plant.box_ends).min(axis=0)[:, None]
+    return altered(plant, box=rows, u_max=np.abs(plant.input_ends).min(axis=0))
 
 
 def test_ellipsoid_is_not_kept_around_a_resting_point():
@@ -273,7 +273,7 @@ def test_limits_with_two_ends_hold_between_samples_and_behind_a_delay(points):
             assert not (info["shield_guaranteed"] & (info["cost"] > 0.0)).any()
             seen |= info["shield_guaranteed"]
         assert seen.all()
-    assert P.low[0] == plant.box_low[0]
+    assert P.low[0] == plant.box_ends[0, 0]
 
 
 @pytest.mark.parametrize("name", published())

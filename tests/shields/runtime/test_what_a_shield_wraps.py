@@ -124,7 +124,7 @@ def test_an_action_counts_as_it_arrives_whatever_wrappers_make_of_it(order):
     env.reset(seed=0)
     for _ in range(30):
         *_, info = env.step(np.ones((2, 1), np.float32))
-        np.testing.assert_array_equal(info["input_proposed"], np.tile(PLANT.input_low, (2, 1)))
+        np.testing.assert_array_equal(info["input_proposed"], np.tile(PLANT.input_ends[0], (2, 1)))
         assert info["shield_guaranteed"].all()
     assert info["episode_interventions"].all()
 
