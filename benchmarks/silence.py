@@ -15,8 +15,6 @@ from benchmarks.commands import run, table
 from benchmarks.random_plants import under_contracts
 from ncs_gym import ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel, certified_error_set
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.registration import registered_ids
 from shields import Certificate, VectorSafetyShield, certificate_for
@@ -24,8 +22,8 @@ from shields.silence import OUTAGES, silence_of, way_back
 
 # What the attack is about.
 ATTACKED = ("CartPole", "CartPoleTwoWay", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping")
-# More samples, and longer ways by a ladder, are not looked for.
-MOST_SAMPLES, LONGEST_LADDER = 30, 10_000
+# Longer ways by a ladder are not looked for.
+LONGEST_LADDER = 10_000
 # Steps of an episode before the network goes silent, and afterwards.
 HEARD, SILENT = 40, 60
 
@@ -76,21 +74,20 @@ def back(ids: Sequence[str] = ()) -> None:
 
 
 def ways(ids: Sequence[str] = ()) -> None:
-    """Three ways back compared, after outages of 10 contracts.
+    """Two ways back compared, after outages of 10 contracts.
 
-    An update that is chosen for the way back, which estimators use; an estimate from the newest samples alone, as at an
-    unknown start; and a ladder of multiples of the certified set, each carried into the next by one sample.
+    An update that is chosen for the way back, which estimators use; and a ladder of multiples of the certified set,
+    each carried into the next by one sample.
     """
-    print(f"{'':20} {'update for it':>15} {'samples alone':>15} {'ladder':>15}")
-    show = table("[steps]", *("each", "rarely") * 3, first=20, width=8)
+    print(f"{'':20} {'update for it':>15} {'ladder':>15}")
+    show = table("[steps]", *("each", "rarely") * 2, first=20, width=8)
 
     def steps_of(plant: LinearPlant, contract: ChannelContract, input_delay: int = 0) -> list[float]:
         errors, age = certified_error_set(plant, contract), contract.max_age
         recursion, gaps = ErrorRecursion(plant, contract.quantization_step, errors), (1, age - input_delay + 1)
         chosen = [way_back(recursion, 10 * age, gap) for gap in gaps]
-        alone = [by_newest_samples(plant, contract, errors, gap) for gap in gaps]
         ladder = [by_ladder(recursion, 10 * age, gap) for gap in gaps]
-        return [np.inf if each is None else each for each in chosen] + alone + ladder
+        return [np.inf if each is None else each for each in chosen] + ladder
 
     def texts(columns: Sequence[float]) -> list[str]:
         return ["never" if np.isinf(each) else f"{each:.0f}" for each in columns]
@@ -100,17 +97,6 @@ def ways(ids: Sequence[str] = ()) -> None:
     steps = np.array([steps_of(*each) for each in under_contracts(30)])
     show("30 random, at most", *texts(np.where(np.isfinite(steps), steps, -np.inf).max(axis=0).tolist()))
     show("  of these never", *np.isinf(steps).sum(axis=0))
-
-
-def by_newest_samples(plant: LinearPlant, contract: ChannelContract, errors: ErrorSet, gap: int) -> float:
-    """Returns how many steps samples must come until they alone prove the error certified; infinite if never."""
-    noise = plant.sensor_error_with(contract.quantization_step).shape_matrix
-    for count in range(1, MOST_SAMPLES + 1):
-        span = (count - 1) * gap
-        samples = {age: np.zeros(plant.p) for age in range(0, span + 1, gap)}
-        if first_estimate(plant, errors, samples, [np.zeros(plant.m)] * span, noise) is not None:
-            return span
-    return np.inf
 
 
 def by_ladder(recursion: ErrorRecursion, outage: int, gap: int) -> float:

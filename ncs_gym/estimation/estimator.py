@@ -14,7 +14,6 @@ from ncs_gym.estimation.error_bound import require_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.error_table import NO_SAMPLE, UNKNOWN, ErrorTable
 from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum
-from ncs_gym.estimation.kalman_filter import ErrorStatistics
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import CopiedWhole, frozen, setting
@@ -130,24 +129,9 @@ class Estimator(PastSteps):
         self.histories = self._usual
         self._begin(mean)
 
-    def restart(self, mean: np.ndarray, inputs: Sequence[np.ndarray]) -> None:
-        """Begins anew with an estimate of an earlier step of the episode: that of the newest sample it was made of.
-
-        Samples taken later can be used when they arrive, the others are discarded from now on.
-
-        Args:
-            mean: An estimate, shape (n,), whose error lies in the certified set of age 0.
-            inputs: What was applied since then, (m,) each, the newest first.
-        """
-        first = ErrorStatistics(self.plant.kalman_covariances[2], self.error_set.shapes[0], 0, True)
-        self.histories = histories_of(self.plant, self.channel, self.error_set, first=first)
-        self._begin(mean, self.step - len(inputs))
-        for u in reversed(inputs):
-            self.advance(u, ())
-
-    def _begin(self, mean: np.ndarray, step: int = 0) -> None:
-        """Forgets everything but an estimate, shape (n,), at a step."""
-        self.step, self.age = step, 0
+    def _begin(self, mean: np.ndarray) -> None:
+        """Forgets everything but an estimate, shape (n,)."""
+        self.step = self.age = 0
         self.alarm = self.damaged = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
         self.history = self.histories.root

@@ -30,14 +30,13 @@ NOT_KNOWN_INSIDE = "the state is not known to be in the safe set"
 LEFT_MODEL = "the state is not known to have stayed where the bound of the linear model's remainder holds"
 LATE_INPUT = "the downlink broke its contract: an input decided earlier was not applied"
 NO_DOWNLINK_CONTRACT = "the downlink has no contract: nothing says that inputs arrive in time"
-# Of loops that learn from samples where they are, and from echoes what was applied; no monitor says so.
-UNKNOWN_START = "the samples do not yet tell where the state is"
+# Of loops that learn from echoes what was applied; no monitor says so.
 NOT_CONFIRMED = "the actuator has not confirmed for too long that it applies what is decided"
 OTHER_EPISODE = "the actuator echoes inputs of another episode: tell it the episode of the loop"
 # Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NOT_KNOWN_INSIDE,
-    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, UNKNOWN_START, NOT_CONFIRMED, NOT_FINITE,
+    LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, NOT_CONFIRMED, NOT_FINITE,
     OTHER_EPISODE, OUTSIDE_BOUND,
 )  # fmt: skip
 CODES = {explanation: code for code, explanation in enumerate(EXPLANATIONS)}
@@ -104,20 +103,16 @@ class GuaranteeMonitor:
         self._under_way = plant.past if self._is_local else 0
         self._limits = np.tile([plant.input_middle, plant.input_half], self._under_way // plant.m)
 
-    def start(
-        self, known_inside: Any, belief: Belief, errors: PredictedErrors, *, is_first: bool = True
-    ) -> MonitorState:
-        """Returns the state at the start of an episode, or where the state of one is found.
+    def start(self, known_inside: Any, belief: Belief, errors: PredictedErrors) -> MonitorState:
+        """Returns the state at the start of an episode.
 
         Args:
             known_inside: Whether every possible start lies in S, or in the box with a certified plan stored.
             belief: What is known.
             errors: What follows from the error shape of the estimate.
-            is_first: Whether no step of the episode led here.
         """
         broken = self._within_limits(known_inside * 0, belief.estimate, errors)
-        state = self._observe(broken, known_inside, belief, errors, 0)
-        return state if is_first else state._replace(wait=longer_wait(state.wait, not self._within_step, 0))
+        return self._observe(broken, known_inside, belief, errors, 0)
 
     def cover(self, state: MonitorState, earlier: Iterable[tuple[Any, Belief, PredictedErrors]]) -> MonitorState:
         """Returns the state at the start with what is known of the steps before the first decision takes effect.

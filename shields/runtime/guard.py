@@ -150,30 +150,23 @@ class OneGuard(Guard):
         belief: Belief,
         known: Sequence[StartKnown],
         earlier: Sequence[tuple[np.ndarray, int]],
-        *,
-        is_first: bool = True,
-        pending: tuple[np.ndarray, ...] = (),
     ) -> None:
-        """Begins to follow whether the state is proved safe, at the start of an episode or where its state is found.
+        """Begins to follow whether the state is proved safe, at the start of an episode.
 
         Args:
             belief: What is known; nobody writes into its estimate.
             known: What is known of x_0 .. x_c (`starts_known`).
             earlier: Estimates of x_0 .. x_{c-1}, before the first decision takes effect, and numbers of their errors.
-            is_first: Whether no step of the episode led here.
-            pending: The inputs decided for the next c steps, none of them at the start of an episode.
         """
         self._take(belief)
         self._moves, self._asked = belief.moves, 0
         self._stored, is_safe = first_store(self.filter, belief.estimate, self.errors, known[-1])
-        self._state = self._monitor.start(is_safe, belief, self.errors, is_first=is_first)
+        self._state = self._monitor.start(is_safe, belief, self.errors)
         if self._schedule is not None:
             self._schedule.start()
-            self._schedule.pending = pending or self._schedule.pending
-            acting = pending or (None,) * len(earlier)
             insides = [
-                known_inside(self.filter, each, mean, self._errors_of.of(belief.table, number), u)
-                for each, (mean, number), u in zip(known[:-1], earlier, acting, strict=True)
+                known_inside(self.filter, each, mean, self._errors_of.of(belief.table, number))
+                for each, (mean, number) in zip(known[:-1], earlier, strict=True)
             ]
             self._state = self._covered(self._state, earlier, insides)
 

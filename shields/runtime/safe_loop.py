@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from enum import Enum, auto
 from typing import Any, ParamSpec, TypeVar
@@ -12,7 +12,6 @@ import numpy as np
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Estimator, LinearPlant, Packet, UnusedPacketsWarning
 from ncs_gym.envs.report import Belief
 from ncs_gym.estimation.arrival_histories import arrival_histories
-from ncs_gym.estimation.first_estimate import first_estimate
 from ncs_gym.network.actuator import AppliedInputs, Command, CommittedInputs, Echo, as_echo
 from ncs_gym.network.channel import require_on_request
 from ncs_gym.network.contract import MAX_AGE, largest_age, warn_of_broken_contract
@@ -34,24 +33,19 @@ from shields.certificate import Certificate
 from shields.certificate_text import contract_text, size_of, table
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
-    ALARM,
     LATE_INPUT,
     NOT_CONFIRMED,
-    NOT_FINITE,
     OTHER_EPISODE,
     OTHER_INPUT,
-    UNKNOWN_START,
 )
 from shields.runtime.guard import OneGuard
 from shields.runtime.safety_filter import SafetyFilter
-from shields.runtime.starts import StartKnown, starts_known
+from shields.runtime.starts import starts_known
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 NOT_STARTED = "no episode is under way: call start"
-# Steps, for every state, whose samples are searched for a state that is not known, beside those of the longest delay.
-STEPS_PER_STATE = 4
 
 
 class _Phase(Enum):
@@ -159,13 +153,6 @@ class SafeLoop(CopiedWhole):
             self._requests = Requests(channel, assumed, self._input_delay)
         self._echo_age = None if echo_age is None else as_count(echo_age, "echo_age", low=0, high=MAX_AGE)
         self._applied = AppliedInputs(self._echo_age)
-        # Samples of this episode that may be used, by stamp; their first stamp and oldest age; and whether there
-        # were two values of one.
-        self._samples: dict[int, np.ndarray] = {}
-        self._used, self._contradicted = (0, 0), False
-        # Inputs, the newest first, from which with samples the state is to be found; None once it is known.
-        self._unknown: tuple[np.ndarray, ...] | None = None
-        self._oldest_sought = STEPS_PER_STATE * plant.n + self._estimator.buffer
         self._discarded, self._told_of = DiscardedPackets(), frozenset[str]()
         self._phase = _Phase.STOPPED
 
@@ -189,24 +176,19 @@ class SafeLoop(CopiedWhole):
         return table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 
     @np.errstate(all="ignore")
-    def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None, *, known: bool = True) -> None:
+    def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
 
-        It is a claim: that the error of x_hat0 lies in `plant.initial_error`. If you do not know that, because the
-        controller was restarted while the plant moved, say `known=False`. Then x_hat0 is a guess to decide from, and
-        nothing is proved until the samples of this episode alone prove where the state is (docs/deployment.md).
-
-        Packets of earlier episodes are discarded from now on: `episode` is the number of the new one.
+        It is a claim: that the error of x_hat0 lies in `plant.initial_error`. Packets of earlier episodes are discarded
+        from now on: `episode` is the number of the new one.
 
         Args:
-            x_hat0: First estimate, shape (n,), whose error lies in `plant.initial_error` if it is known.
+            x_hat0: First estimate, shape (n,), whose error lies in `plant.initial_error`.
             initial_set: What the state is known to lie in besides, an ellipsoid or the state itself, shape (n,). It
                 counts where x_hat0 alone does not prove that the state is in S (in mode "lookahead": in the box).
-            known: Whether all that is claimed.
 
         Raises:
-            ValueError: If an argument is not finite or does not fit the plant, or an initial set is given for a state
-                that is not known; nothing has changed then.
+            ValueError: If an argument is not finite or does not fit the plant; nothing has changed then.
             GuaranteeLostError: If the state is not proved safe and that is to be raised; the episode has begun then.
         """
         n = self._filter.plant.n
@@ -215,8 +197,6 @@ class SafeLoop(CopiedWhole):
             initial_set = as_vector(initial_set, n, "initial_set")
         if isinstance(initial_set, Ellipsoid) and initial_set.dim != n:
             raise ValueError(f"initial_set must have dimension {n}, got {initial_set.dim}")
-        if not as_flag(known, "known") and initial_set is not None:
-            raise ValueError("initial_set says what is known of the state: leave it out, or leave out known=False")
         inside = starts_known(self._filter, initial_set, self._input_delay)
         self._phase = _Phase.STOPPED
         self._estimator.reset(mean)
@@ -225,10 +205,9 @@ class SafeLoop(CopiedWhole):
         self._applied.start()
         if self._requests is not None:
             self._requests.begin()
-        self._samples, self._contradicted = {}, False
-        self._used = (1, self._estimator.buffer) if known else (0, self._oldest_sought)
-        self._unknown = None if known else ()
-        self._begin(inside)
+        pending = self._inputs.pending
+        earlier = [self._estimator.numbered(pending[:steps]) for steps in range(self._input_delay)]
+        self._guard.start(self._belief(None), inside, earlier)
         self._phase = _Phase.STARTED
         self._guard.lost.begin()
         self._guard.lost.tell_of(self.reason)
@@ -240,8 +219,8 @@ class SafeLoop(CopiedWhole):
         Behind a downlink it is that of the step at which the input decided next takes effect.
 
         At step 0 it is the first estimate: packets from before the first step are of no use, nor is a later sample of
-        step 0, which a known first estimate stands for. Nothing compares the two.
-        Whether the start is known or not, two values of a sample that may be used end the guarantee of the episode.
+        step 0, which the first estimate stands for. Two values of a sample that was used end the guarantee of the
+        episode.
 
         Args:
             packets: What arrived since the last call, in any order; duplicates, late ones and those of another episode
@@ -274,19 +253,13 @@ class SafeLoop(CopiedWhole):
         if phase is _Phase.RECEIVED:
             raise RuntimeError("receive was called twice in a step: hand over all packets of a step in one call")
         self._phase = _Phase.STOPPED
-        self._take_in(arrived, self.steps + (phase is _Phase.DECIDED))
         if phase is _Phase.DECIDED:
             due = self._inputs.pop()
             told = due if applied is None else _as_input(applied, due.shape)
-            taken = due if told is None else told
             self._applied.add(due)
-            self._estimator.advance(taken, arrived)
+            self._estimator.advance(due if told is None else told, arrived)
             self._guard.observe(self._belief(told))
-            if self._unknown is not None:  # samples of before tell nothing of a state that an unknown input moved
-                self._unknown = () if told is None else (taken, *self._unknown[: self._oldest_sought])
         self._applied.compare(heard, self.steps, self.episode)
-        if self._unknown is not None:
-            self._find(self._unknown)
         before, oldest = self._discarded, self._estimator.channel.longest_delay
         self._discarded = before.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
@@ -327,7 +300,7 @@ class SafeLoop(CopiedWhole):
         decision = decision._replace(input=decision.input.copy())  # the caller may write into it
         self._inputs.commit(decision.input)
         if requests is not None:
-            requests.ask(ask or self._unknown is not None)  # a state that is not known is to be found
+            requests.ask(ask)
             requests.decide(self._estimator.age)
         self._phase = _Phase.DECIDED
         return decision
@@ -385,11 +358,6 @@ class SafeLoop(CopiedWhole):
             return NOT_STARTED
         if self._applied.is_other:
             return LATE_INPUT if self._input_delay else OTHER_INPUT
-        if self._contradicted:
-            return ALARM
-        if self._unknown is not None:
-            is_finite = all(np.isfinite(y).all() for y in self._recent(self._unknown).values())
-            return UNKNOWN_START if is_finite else NOT_FINITE
         if (reason := self._guard.reason) or self._applied.is_confirmed(self.steps):
             return reason
         return OTHER_EPISODE if self._applied.hears_of_others(self.steps) else NOT_CONFIRMED
@@ -454,46 +422,12 @@ class SafeLoop(CopiedWhole):
             raise RuntimeError(NOT_STARTED)
         return self._phase
 
-    def _begin(self, known: Sequence[StartKnown]) -> None:
-        """Begins to follow whether the state is proved safe, with what is known of x_0 .. x_c."""
-        pending = self._inputs.pending
-        earlier = [self._estimator.numbered(pending[:steps]) for steps in range(self._input_delay)]
-        self._guard.start(self._belief(None), known, earlier, is_first=self.steps == 0, pending=pending)
-
-    def _take_in(self, packets: Iterable[Packet], step: int) -> None:
-        """Keeps the samples of this episode that arrive by a step and may be used, and notes two values of one."""
-        first, oldest = self._used
-        for packet in packets:
-            if packet.episode == self.episode and first <= packet.stamp <= step <= packet.stamp + oldest:
-                before = self._samples.setdefault(packet.stamp, packet.measurement)
-                self._contradicted |= not np.array_equal(before, packet.measurement, equal_nan=True)
-        self._samples = {stamp: y for stamp, y in self._samples.items() if step <= stamp + oldest}
-
-    def _recent(self, inputs: tuple[np.ndarray, ...]) -> dict[int, np.ndarray]:
-        """Returns the samples, shape (p,), by stamp, since which all inputs are known."""
-        return {stamp: y for stamp, y in self._samples.items() if self.steps - stamp <= len(inputs)}
-
-    def _find(self, inputs: tuple[np.ndarray, ...]) -> None:
-        """Begins anew where samples prove the state that is not known; inputs of shape (m,), the newest first."""
-        step, plant = self.steps, self._filter.plant
-        noise = plant.sensor_error_with(self._estimator.channel.quantization_step).shape_matrix
-        usable = {stamp: y for stamp, y in self._recent(inputs).items() if np.isfinite(y).all()}
-        # As of the newest sample: those that are on their way can then be used, and the contract counts on them.
-        newest = max(usable, default=step)
-        by_age, since = {newest - stamp: y for stamp, y in usable.items()}, step - newest
-        found = first_estimate(plant, self._estimator.error_set, by_age, inputs[since:], noise)
-        if found is not None:
-            self._unknown = None
-            self._estimator.restart(found[0], inputs[:since])
-            self._begin(starts_known(self._filter, None, self._input_delay))
-
     def _belief(self, applied: np.ndarray | None) -> Belief:
         """Returns what is known now, given the input applied in the last step; None if it is not known."""
         estimator = self._estimator
         estimate, number = estimator.numbered(self._inputs.pending[: self._input_delay])
         applied = np.full(self._filter.plant.m, np.nan) if applied is None else applied
-        alarm = estimator.alarm or self._contradicted
-        seen = estimate, number, estimator.table, estimator.age, alarm, estimator.damaged, False
+        seen = estimate, number, estimator.table, estimator.age, estimator.alarm, estimator.damaged, False
         return Belief(*seen, applied, self._decided, self.steps)
 
     def _predicted(self) -> tuple[np.ndarray, np.ndarray]:

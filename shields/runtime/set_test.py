@@ -230,14 +230,11 @@ class SetTest:
             left = (half - (np.abs(values - middle) + errors.own)).min(axis=0)
         return left >= margin + self.rounding * self.own_columns.dot(np.abs(estimates))
 
-    def keeps_within_step(
-        self, estimate: np.ndarray, errors: PredictedErrors, margin: float, u: np.ndarray | None = None
-    ) -> bool:
-        """Returns whether the limits within this step are kept with input u or none."""
+    def keeps_within_step(self, estimate: np.ndarray, errors: PredictedErrors, margin: float) -> bool:
+        """Returns whether the limits within this step are kept under a zero input."""
         first = len(self.root)
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         values = self.state_rows[first:].dot(estimate)
-        values = values if u is None else values + self.input_rows[first:].dot(u)
         middle, row_limits = self.middle[first - self.cone :], errors.row_limits[first - self.cone :]
         return bool((np.abs(values - middle) <= row_limits - rounding - margin).all())
 

@@ -125,21 +125,14 @@ def starts_known(
     return tuple(known)
 
 
-def known_inside(
-    safety_filter: SafetyFilter,
-    known: StartKnown,
-    estimate: np.ndarray,
-    errors: PredictedErrors,
-    u: np.ndarray | None = None,
-) -> bool:
+def known_inside(safety_filter: SafetyFilter, known: StartKnown, estimate: np.ndarray, errors: PredictedErrors) -> bool:
     """Returns whether one of the states x_0 .. x_{c-1} is known to be in the safe set; in mode "lookahead" in the box.
 
-    Either from where starts are possible, or from its estimate, shape (n,), and from the input u that acts then, shape
-    (m,), decided before; there is none at the start of an episode.
+    Either from where starts are possible, or from its estimate, shape (n,). The input that acts then is zero.
     """
     if known.in_box:
         return True
-    if not safety_filter.test.keeps_within_step(estimate, errors, MARGIN, u):
+    if not safety_filter.test.keeps_within_step(estimate, errors, MARGIN):
         return False
     inside = bool(safety_filter.test.knows_inside(estimate, errors, MARGIN))
     return inside or safety_filter.lookahead.knows_in_box(estimate, errors)

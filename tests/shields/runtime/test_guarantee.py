@@ -106,7 +106,7 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
             assert EXPLANATIONS[monitor.reasons(states[e])] == reference.reason
         seen |= set(reasons)
     never = {proof.OLD_SAMPLE, proof.LEFT_MODEL, proof.LATE_INPUT, proof.NO_DOWNLINK_CONTRACT}
-    never |= {proof.UNKNOWN_START, proof.NOT_CONFIRMED, proof.NOT_FINITE, proof.OTHER_EPISODE, proof.OUTSIDE_BOUND}
+    never |= {proof.NOT_CONFIRMED, proof.NOT_FINITE, proof.OTHER_EPISODE, proof.OUTSIDE_BOUND}
     assert seen == set(EXPLANATIONS) - never
 
 

@@ -219,8 +219,6 @@ OF_LOOP: list[tuple[bool, Callable[[SafeLoop], Any], type[Exception], str]] = [
     (True, lambda loop: loop.start([np.nan, 0.0]), ValueError, r"x_hat0 = \(.*\) must be finite"),
     (False, lambda loop: loop.start(TWO, [1.0]), ValueError, "initial_set must have shape"),
     (True, lambda loop: loop.start(TWO, Ellipsoid(np.eye(3))), ValueError, "initial_set must have dimension 2"),
-    (True, lambda loop: loop.start(TWO, TWO, known=False), ValueError, "initial_set says what is known"),
-    (True, lambda loop: loop.start(TWO, known="yes"), ValueError, "known must be"),
 ]
 
 

@@ -9,8 +9,7 @@ import pytest
 
 from ncs_gym import Actuator, Channel, Packet, truck_trailer
 from ncs_gym.processes.plant_step import PlantSimulation
-from shields import GuaranteeLostWarning
-from shields.runtime.guarantee import NOT_FINITE, UNKNOWN_START
+from shields.runtime.guarantee import NOT_FINITE
 from tests.certificates import certificate_of
 from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
@@ -56,23 +55,6 @@ def test_echoes_for_a_loop_that_compares_none_are_refused():
     with pytest.raises(ValueError, match="echo_age"):
         loop.receive(echoes=[actuator.echo])
     loop.receive(echoes=[])
-    assert loop.guaranteed
-
-
-def test_sample_without_a_reading_is_named_while_the_state_is_sought_and_the_others_tell_where_it_is():
-    loop = started()
-    loop.start(np.zeros(2), known=False)
-    assert loop.reason == UNKNOWN_START
-    with pytest.warns(GuaranteeLostWarning, match="a sample held NaN or infinity"):
-        loop.step(0.0, [Packet(0, [0.0, np.nan], loop.episode)])
-    for step in range(1, 20):
-        loop.step(0.0, [Packet(step, [np.inf, 0.0], loop.episode)])
-        assert loop.reason == NOT_FINITE
-    for _ in range(20):  # what was held is too old
-        loop.step(0.0)
-    assert loop.reason == UNKNOWN_START
-    for _ in range(5):
-        loop.step(0.0, [Packet(loop.steps + 1, np.zeros(2), loop.episode)])
     assert loop.guaranteed
 
 
