@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from agents.evaluation import evaluate
     from agents.hyperparams import tuned_hyperparams, tuned_steps
     from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
-    from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped, Trajectory
+    from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped
     from agents.sb3_vec_env import SB3VecEnv
     from agents.training import TrainingResult, train, untrained
 
@@ -40,7 +40,6 @@ __all__ = [
     "TrainingPoint",
     "TrainingResult",
     "TrainingStopped",
-    "Trajectory",
     "evaluate",
     "pretrained",
     "pretrained_folder",
@@ -57,7 +56,7 @@ _MODULES = {
     "loop": ("LagrangianSettings", "LoopConfig", "ShieldSettings"),
     "evaluation": ("evaluate",),
     "hyperparams": ("tuned_hyperparams", "tuned_steps"),
-    "results": ("Episode", "Evaluation", "TrainingPoint", "TrainingStopped", "Trajectory"),
+    "results": ("Episode", "Evaluation", "TrainingPoint", "TrainingStopped"),
     "sb3_vec_env": ("SB3VecEnv",),
     "agent_file": ("AgentError", "pretrained_folder"),
     "training": ("TrainingResult", "train", "untrained"),

@@ -154,8 +154,9 @@ class LearningSettings(BackendSettings):
         certificate: Certificate file to use instead of synthesizing one.
         safe_set: What a synthesized certificate keeps.
         between_samples: Times per step at which the safe box counts; by default the plant's own.
-        channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
-            jitter, send_period, quantization_step, max_consecutive_losses.
+        channel: Changes of the environment's channel: loss (of bursts
+            'loss={"p_good_to_bad": 0.1, "p_bad_to_good": 0.3}'), delay, jitter, send_period, quantization_step,
+            max_consecutive_losses.
         hyperparams: Hyperparameters in the words of stable-baselines3, such as gamma=0.99 or
             'policy_kwargs={"net_arch": [64]}'; others are tuned for the environment, or the default.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step; no option of the command line.
