@@ -143,17 +143,7 @@ def _scanned(problem: OptimizationProblem) -> tuple[tuple[float, float, float], 
     return tuple(sorted(points))
 
 
-def largest_gamma(scan: FeasibilityScan, plant: LinearPlant) -> float:
-    """Returns the largest gamma for which OP is feasible, all else being as it is; 0.0 if there is none."""
-    return scan.largest(lambda gamma: with_noise(plant, gamma=gamma), max(plant.gamma, 1e-12))
-
-
 def largest_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
     """Returns the largest common factor on gamma, Q and P0 for which OP is feasible; 0.0 if there is none."""
     gamma, Q, P0 = plant.gamma, plant.process_noise_cov, plant.initial_cov
     return scan.largest(lambda by: with_noise(plant, gamma=by * gamma, Q=by * Q, P0=by * P0), 1.0)
-
-
-def largest_noise_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
-    """Returns the largest factor on Q for which OP is feasible, gamma being as it is; 0.0 if there is none."""
-    return scan.largest(lambda factor: with_noise(plant, Q=factor * plant.process_noise_cov), 1.0)
