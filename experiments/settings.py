@@ -17,8 +17,6 @@ from agents.loop import LagrangianSettings
 from ncs_gym.validation import shown
 from shields.runtime.safety_filter import LONGEST_HORIZON
 
-_ADDRESS = re.compile(r"local|auto|[\w.-]+:\d{1,5}|\[[0-9a-fA-F:]+\]:\d{1,5}")
-
 
 def _assignments(texts: list[str]) -> dict[str, Any]:
     """Returns the values by name, each a JSON value or a word such as `lin_0.003`."""
@@ -112,8 +110,6 @@ class BackendSettings:
 
     def __post_init__(self) -> None:
         require_limits(self, jobs=1)
-        if not _ADDRESS.fullmatch(self.ray_address):
-            raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
         if self.engine == "local" and self.ray_address != "local":
             raise ValueError("--ray-address is a setting of --engine ray")
 

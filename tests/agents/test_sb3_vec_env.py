@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from agents import LoopConfig, SB3VecEnv, train
 from ncs_gym import Channel, VectorNetworked, VectorRequestActions
-from shields import SafetyShield, VectorSafetyShield
+from shields import VectorSafetyShield
 from tests.product import vector_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -223,18 +223,6 @@ def test_attributes():
         SB3VecEnv(gym.make("CartPole-v1"))
 
 
-def test_wrappers_around_environments_of_their_own_are_seen():
-    vector = gym.make_vec(CRUISE, num_envs=2, vectorization_mode="sync", wrappers=[SafetyShield])
-    env = SB3VecEnv(vector)
-    for wrapper, is_around in (
-        (SafetyShield, True), (gym.wrappers.TimeLimit, True), (gym.Wrapper, True), (Monitor, True),
-        (gym.wrappers.ClipAction, False),
-    ):  # fmt: skip
-        assert env.env_is_wrapped(wrapper) == [is_around] * 2
-        assert env.env_is_wrapped(wrapper, 1) == [is_around]
-    env.close()
-
-
 def test_evaluate_policy_counts_episodes_by_its_infos():
     env = VecMonitor(SB3VecEnv(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=20)))
     model = PPO("MlpPolicy", VecNormalize(env), seed=0, device="cpu", n_steps=32).learn(96)
@@ -290,10 +278,6 @@ class Laps(gym.Env):
         ends = self.steps == 7 + self.lap
         return np.zeros(1, np.float32), 0.0, False, ends, info | ({"end": float(self.steps)} if ends else {})
 
-    def set_scale(self, scale):
-        self.scale = scale
-        return scale
-
 
 @pytest.mark.parametrize("nested", [True, False])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
@@ -310,17 +294,6 @@ def test_infos_are_those_that_each_environment_reported(mode, nested):
             assert {key: mine[key] for key in mine if key != "episode"} == expected
         assert ours.reset_infos == theirs.reset_infos
     assert ends > 6
-
-
-@pytest.mark.parametrize("kind", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
-def test_methods_are_called_of_all_environments(kind):
-    envs = SB3VecEnv(kind([lambda: Laps(2)] * 2), info_keywords=("scale",))
-    envs.reset()
-    with pytest.raises(ValueError, match="calls methods of all environments"):
-        envs.env_method("set_scale", 5.0, indices=[1])
-    assert envs.env_method("set_scale", 4.0) == [4.0, 4.0]
-    assert [info["scale"] for info in envs.step(np.zeros((2, 1)))[3]] == [4.0, 4.0]
-    envs.close()
 
 
 def test_normalization_that_cannot_reset_some_environments_is_refused():
