@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ncs_gym import ChosenLimitsWarning
+from ncs_gym.limits import ChosenLimitsWarning
 from tests.product import altered, linear_plant
 
 QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}

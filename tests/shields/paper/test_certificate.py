@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from ncs_gym import truck_trailer
-from shields import Infeasible, certify, verify
+from shields import Infeasible, verify
 from shields.paper.bounds import PaperModel
 from shields.paper.feasibility import FeasibilityScan, largest_scale
+from shields.synthesis import certify
 from tests.product import altered, library_plant, linear_plant, paper_synthesis, safety_filter, safety_shield
 from tests.verdicts import broken, verified
 

@@ -5,18 +5,10 @@ import pickle
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    Actuator,
-    Channel,
-    ChannelContract,
-    Command,
-    Ellipsoid,
-    Packet,
-    cart_pole,
-    certified_error_set,
-    truck_trailer,
-)
+from ncs_gym import Actuator, Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truck_trailer
+from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.first_estimate import first_estimate
+from ncs_gym.network.actuator import Command
 from ncs_gym.processes.cart_pole_process import nonlinear_cart_pole
 from shields.runtime.guarantee import (
     ALARM,

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ncs_gym import Actuator, Channel, ChannelContract, Packet, cart_pole, lane_keeping, truck_trailer
+from ncs_gym import Actuator, Channel, ChannelContract, Packet, cart_pole, truck_trailer
+from ncs_gym.plants.lane_keeping import lane_keeping
 from tests.certificates import certificate_of
 from tests.product import safe_loop, vector_env, vector_shield
 
