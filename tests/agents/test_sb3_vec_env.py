@@ -201,14 +201,11 @@ def test_attributes():
     ):
         with pytest.raises(AttributeError):
             call()
-    with pytest.raises(AttributeError, match=r"are no objects of their own: use vec_env\.vector_env$"):
+    with pytest.raises(AttributeError, match=r"reaches no request of single environments: use vec_env\.vector_env$"):
         env.env_method("request")
-    sync = SB3VecEnv(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
-    sync.set_attr("length", 0.7, indices=1)
-    assert sync.get_attr("length") == [0.5, 0.7]
-    stacked = SB3VecEnv(VectorNetworked(sync.vector_env, Channel(delay=2), observe=("age",)))
+    sync = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync")
+    stacked = SB3VecEnv(VectorNetworked(sync, Channel(delay=2), observe=("age",)))
     assert stacked.get_attr("channel") == [Channel(delay=2)] * 2
-    assert stacked.get_attr("length") == [0.5, 0.7]
     assert stacked.get_attr("observation_space") == [stacked.observation_space] * 2
     asking = SB3VecEnv(VectorRequestActions(gym.make_vec("ncs_gym/ConvoyOnRequest-v0", num_envs=2)))
     assert asking.get_attr("action_space") == [asking.action_space] * 2
@@ -216,8 +213,6 @@ def test_attributes():
     asking.seed(3)
     asking.reset()
     assert asking.get_attr("np_random_seed") == [3, 3]
-    sync.reset()
-    assert len(sync.env_method("get_wrapper_attr", "length")) == 2
     env.close()
     with pytest.raises(ValueError, match="must be a gymnasium VectorEnv"):
         SB3VecEnv(gym.make("CartPole-v1"))
