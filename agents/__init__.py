@@ -6,20 +6,19 @@ also serve training code of your own. What needs stable-baselines3 or torch (the
 first asked for.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ncs_gym.installation import install_command, require_own_packages
+from agents.agent_file import AgentError, pretrained_folder
+from agents.evaluation import evaluate
+from agents.hyperparams import tuned_hyperparams, tuned_steps
+from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
+from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped
+from ncs_gym.installation import install_command
 
 if TYPE_CHECKING:
     from agents.agent import Agent, pretrained
-    from agents.agent_file import AgentError, pretrained_folder
     from agents.algorithms import AppliedActionBuffer
     from agents.callbacks import DualAscentCallback, SafetyCallback
-    from agents.evaluation import evaluate
-    from agents.hyperparams import tuned_hyperparams, tuned_steps
-    from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
-    from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped, Trajectory
     from agents.sb3_vec_env import SB3VecEnv
     from agents.training import TrainingResult, train, untrained
 
@@ -40,7 +39,6 @@ __all__ = [
     "TrainingPoint",
     "TrainingResult",
     "TrainingStopped",
-    "Trajectory",
     "evaluate",
     "pretrained",
     "pretrained_folder",
@@ -50,42 +48,25 @@ __all__ = [
     "untrained",
 ]
 
-_MODULES = {
-    "agent": ("Agent", "pretrained"),
-    "algorithms": ("AppliedActionBuffer",),
-    "callbacks": ("DualAscentCallback", "SafetyCallback"),
-    "loop": ("LagrangianSettings", "LoopConfig", "ShieldSettings"),
-    "evaluation": ("evaluate",),
-    "hyperparams": ("tuned_hyperparams", "tuned_steps"),
-    "results": ("Episode", "Evaluation", "TrainingPoint", "TrainingStopped", "Trajectory"),
-    "sb3_vec_env": ("SB3VecEnv",),
-    "agent_file": ("AgentError", "pretrained_folder"),
-    "training": ("TrainingResult", "train", "untrained"),
-}
-# Packages of the extra `train` that modules here import.
-_OF_TRAINING = {"torch", "stable_baselines3"}
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-
 
 def __dir__() -> list[str]:
-    """Returns the public names, of which none needs to be imported yet."""
+    """Returns the public names, some of which need not be imported yet."""
     return __all__
 
 
 def __getattr__(name: str) -> Any:
-    """Imports the module of a public name when the name is first asked for.
+    """Imports what needs the extra `train` when it is first asked for.
 
     Raises:
-        ModuleNotFoundError: If a package of the extra `train` is missing; it says what to type.
+        ModuleNotFoundError: If a package of the extra is missing; it says what to type.
     """
-    if name not in _MODULE_OF:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    require_own_packages("shields")
     try:
-        module = import_module(f"{__name__}.{_MODULE_OF[name]}")
+        from agents import agent, training
     except ModuleNotFoundError as error:
-        if error.name not in _OF_TRAINING:
+        if error.name not in ("torch", "stable_baselines3"):
             raise
         needed = f"agents.{name} needs stable_baselines3 and torch, and {error.name} is not installed"
         raise ModuleNotFoundError(f"{needed}: {install_command('train')}", name=error.name) from error
-    return getattr(module, name)
+    return getattr(training if hasattr(training, name) else agent, name)

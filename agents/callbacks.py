@@ -17,8 +17,6 @@ from agents.sb3_vec_env import INFO_KEYWORDS, SB3VecEnv
 OTHERS = 'agents.train is for environments with "cost" in their infos: train others by stable-baselines3 itself'
 # The history has about this many points where every step of all environments is a rollout.
 _MAX_POINTS = 200
-# An agent that is trained is kept about so often on the way.
-_TIMES = 10
 
 
 class SafetyCallback(BaseCallback):
@@ -149,25 +147,6 @@ class DualAscentCallback(BaseCallback):
             self._priced.penalty = max(0.0, self._priced.penalty + self._settings.learning_rate * excess)
             self._cost, self._steps = 0.0, 0
         self.logger.record("safety/multiplier", self._priced.penalty)
-
-
-class RegularCallback(BaseCallback):
-    """Does something about ten times while an agent is trained, between rollouts."""
-
-    def __init__(self, act: Callable[[], None]) -> None:
-        super().__init__()
-        self._act = act
-
-    def _on_training_start(self) -> None:
-        self._due = self._interval = self.locals["total_timesteps"] / _TIMES
-
-    def _on_rollout_start(self) -> None:
-        if self.num_timesteps >= self._due:
-            self._act()
-            self._due = self.num_timesteps + self._interval
-
-    def _on_step(self) -> bool:
-        return True
 
 
 def _counted(callback: BaseCallback) -> dict[str, Any]:

@@ -9,10 +9,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from agents.loop import LoopConfig
-from agents.results import Episode, Evaluation, Trajectory
+from agents.results import Episode, Evaluation
 from ncs_gym import NCSVectorEnv
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.envs.spaces import read_actions
 from shields.polytope import Polytope
 
 # The largest number of episodes that are played side by side.
@@ -32,7 +31,6 @@ def evaluate(
     seed: int,
     safe_set: np.ndarray | Polytope | None = None,
     on_progress: Callable[[int], None] | None = None,
-    shown: int = 0,
 ) -> Evaluation:
     """Returns what a policy does in a number of episodes, played side by side.
 
@@ -44,27 +42,21 @@ def evaluate(
         seed: Seed of all random numbers (see `Episode.index`).
         safe_set: M, shape (n, n), or a polytope, for `Episode.times_safe_set`.
         on_progress: Called with the number of steps taken since its last call.
-        shown: Number of the episode whose trajectory is returned.
 
     Raises:
-        ValueError: If there is no episode to play or to show, episodes have no limit of steps, or the id is registered
-            with SAME_STEP autoreset.
+        ValueError: If there is no episode to play, episodes have no limit of steps, or the id is registered with
+            SAME_STEP autoreset.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
-    if not 0 <= shown < episodes:
-        raise ValueError(f"shown must be the number of one of {episodes} episodes, got {shown}")
     if loop.episode_steps is None:
         raise ValueError(f"{loop.env} has no max_episode_steps, without which an evaluation may not end: give some")
     alone = loop.without_penalties.with_kwargs(autoreset_mode=None)
     finished: list[Episode] = []
-    trajectory: Trajectory | None = None
     for first in range(0, episodes, _MAX_PARALLEL_EPISODES):
         indices = range(first, min(first + _MAX_PARALLEL_EPISODES, episodes))
-        played, path = _played(alone, policy, indices, seed, safe_set, on_progress, shown)
-        trajectory = trajectory or path
-        finished += played
-    return Evaluation(loop, finished, trajectory)  # type: ignore[arg-type]
+        finished += _played(alone, policy, indices, seed, safe_set, on_progress)
+    return Evaluation(loop, finished)
 
 
 def _played(
@@ -74,9 +66,8 @@ def _played(
     seed: int,
     safe_set: np.ndarray | Polytope | None,
     on_progress: Callable[[int], None] | None,
-    shown: int,
-) -> tuple[list[Episode], Trajectory | None]:
-    """Returns episodes played side by side, and the trajectory of one, None if it is not among them."""
+) -> list[Episode]:
+    """Returns episodes played side by side."""
     count, envs = len(indices), loop.vector(len(indices))
     inner: Any = envs.unwrapped
     if envs.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
@@ -88,7 +79,7 @@ def _played(
         envs = loop.vector(count, terminate_on_violation=False)
     env_seed = int(np.random.SeedSequence([seed, indices[0], _SEED_STREAM]).generate_state(1)[0] >> 1)
     observations, info = envs.reset(seed=env_seed)
-    infos, nothing = [info], np.zeros(count, np.bool_)
+    nothing = np.zeros(count, np.bool_)
     running, ended, guaranteed = ~nothing, nothing, ~nothing
     returns, largest = np.zeros(count), np.full(count, np.nan if safe_set is None else 0.0)
     names = ("steps", "violation_steps", "estimate_violation_steps", "interventions", "planned", "proved")
@@ -100,16 +91,13 @@ def _played(
         running &= ~ended
         if not running.any():
             break
-        actions = policy(observations, info)
-        observations, rewards, terminated, truncated, info = envs.step(actions)
-        if shown in indices and running[shown - indices[0]]:
-            # Filters of others need not report what was proposed to them.
-            infos.append({"input_proposed": read_actions(plant, actions, count)[1].T} | info)
+        observations, rewards, terminated, truncated, info = envs.step(policy(observations, info))
         returns += np.where(running, rewards, 0.0)
+        estimates = info["state"] + info["estimation_error"]  # "estimate" is that of when the next action acts
         happened = {
             "steps": ~nothing,
             "violation_steps": info["cost"] > 0.0,
-            "estimate_violation_steps": plant.constraint_values(_estimates(info).T).max(axis=0) > 0.0,
+            "estimate_violation_steps": plant.constraint_values(estimates.T).max(axis=0) > 0.0,
             "interventions": info.get("shield_intervened", nothing).astype(np.bool_),
             "planned": info.get("shield_plan_length", nothing) > 0,
             "proved": info.get("shield_guaranteed", nothing).astype(np.bool_),
@@ -122,7 +110,7 @@ def _played(
         if on_progress is not None:
             on_progress(count)
     envs.close()
-    episodes = [
+    return [
         Episode(
             index=index,
             episode_return=float(returns[e]),
@@ -132,9 +120,6 @@ def _played(
         )
         for e, index in enumerate(indices)
     ]
-    if shown not in indices:
-        return episodes, None
-    return episodes, _trajectory(infos, shown - indices[0], single.downlink_protocol.input_delay)
 
 
 def _times(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
@@ -142,28 +127,3 @@ def _times(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
     if isinstance(of, Polytope):
         return of.gauge(states)
     return np.sqrt(np.maximum(np.einsum("ei,ij,ej->e", states, of, states), 0.0))
-
-
-def _estimates(info: dict[str, np.ndarray]) -> np.ndarray:
-    """Returns the estimates of the present states, shape (N, n); `estimate` is that of when the next action acts."""
-    return info["state"] + info["estimation_error"]
-
-
-def _trajectory(infos: list[dict[str, np.ndarray]], e: int, input_delay: int) -> Trajectory:
-    """Returns the trajectory of an environment, whose inputs are applied some steps after they are decided."""
-    steps = infos[1:]
-    not_shielded = np.zeros(e + 1, np.bool_)
-    inputs = np.array([info["input"][e] for info in steps])
-    proposed, intervened = inputs.copy(), np.zeros(len(steps), np.bool_)
-    for step, info in enumerate(steps[: max(len(steps) - input_delay, 0)], input_delay):
-        proposed[step] = info["input_proposed"][e]
-        intervened[step] = info.get("shield_intervened", not_shielded)[e]
-    return Trajectory(
-        states=np.array([info["state"][e] for info in infos]),
-        estimates=np.array([_estimates(info)[e] for info in infos]),
-        inputs=inputs,
-        proposed=proposed,
-        intervened=intervened,
-        arrivals=np.array([info["packet_arrived"][e] for info in steps], dtype=np.bool_),
-        violated=np.array([info["cost"][e] > 0.0 for info in steps], dtype=np.bool_),
-    )

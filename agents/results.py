@@ -91,30 +91,6 @@ class Episode(_Totals):
     proved: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """One episode of T steps, step by step; behind a downlink what is decided for a step belongs to it, not to before.
-
-    Attributes:
-        states: True states, shape (T + 1, n).
-        estimates: Estimates of these states, shape (T + 1, n).
-        inputs: Applied inputs, shape (T, m).
-        proposed: Inputs that the agent proposed for these steps, shape (T, m); behind a downlink those applied in the
-            first steps, for which there is no proposal.
-        intervened: Whether the shield intervened, or would have in mode "monitor", when they were decided, shape (T,).
-        arrivals: Whether a packet arrived after each step, shape (T,).
-        violated: Whether each step cost something, shape (T,): of any limit, also of inputs and between two samples.
-    """
-
-    states: np.ndarray
-    estimates: np.ndarray
-    inputs: np.ndarray
-    proposed: np.ndarray
-    intervened: np.ndarray
-    arrivals: np.ndarray
-    violated: np.ndarray
-
-
 @dataclass(frozen=True, repr=False)
 class Evaluation:
     """The finished episodes of an evaluation.
@@ -122,12 +98,10 @@ class Evaluation:
     Attributes:
         loop: The control loop that they were played in, but for its penalties.
         episodes: All episodes, in order of their index.
-        trajectory: The episode that was asked for, the first by default, step by step.
     """
 
     loop: LoopConfig
     episodes: list[Episode]
-    trajectory: Trajectory
 
     def __repr__(self) -> str:
         """Short, in place of all episodes."""

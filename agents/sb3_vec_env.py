@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv, VectorWrapper
 from gymnasium.wrappers.vector import NormalizeObservation
-from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -24,8 +23,6 @@ torch.set_num_threads(1)
 
 # Vector environments whose reset takes options={"reset_mask": ...} and resets only the environments in the mask.
 _WITH_RESET_MASK = (NCSVectorEnv, SyncVectorEnv, AsyncVectorEnv)
-# Those whose environments are objects of their own.
-_OF_ENVIRONMENTS = (SyncVectorEnv, AsyncVectorEnv)
 # What gymnasium reports of ends of episodes, beside the infos of the next ones.
 _FINAL = ("final_obs", "final_info")
 # Infos that callbacks of the package and of others read at every step.
@@ -114,7 +111,7 @@ class SB3VecEnv(VecEnv):
                 'list, {"channel": [c_1, ..., c_N]}, or draw them with VectorRandomChannel'
             )
         seeds: Any = None if self._seeds[0] is None else self._seeds
-        if seeds is not None and not isinstance(self.vector_env.unwrapped, _OF_ENVIRONMENTS):
+        if seeds is not None and not isinstance(self.vector_env.unwrapped, (SyncVectorEnv, AsyncVectorEnv)):
             seeds = seeds[0]
         observation, info = self.vector_env.reset(seed=seeds, options=options or None)
         require_batched_infos(info, "SB3VecEnv")
@@ -180,9 +177,7 @@ class SB3VecEnv(VecEnv):
         self.vector_env.close()
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Returns an attribute of each environment, or of the outermost wrapper of vector environments that has it.
-
-        Of a vector environment or a wrapper that is one object, the same for all.
+        """Returns an attribute of the outermost vector wrapper or environment that has it, the same for all.
 
         Raises:
             AttributeError: If there is no such attribute, or it holds arrays, which may be about all environments.
@@ -192,62 +187,30 @@ class SB3VecEnv(VecEnv):
             return [getattr(self, attr_name) for _ in chosen]
         while source is not source.unwrapped and (hasattr(VectorWrapper, attr_name) or not _has_own(source, attr_name)):
             source = source.env  # pyright: ignore[reportAttributeAccessIssue]
-        if isinstance(source, _OF_ENVIRONMENTS):
-            values = source.get_attr(attr_name)
-            return [values[e] for e in chosen]
         value = getattr(source, attr_name)
         if any(isinstance(each, np.ndarray) for each in (value if isinstance(value, tuple) else (value,))):
             raise AttributeError(f"{attr_name} is an array of {type(source).__name__}: read it from vector_env")
         return [value for _ in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Sets an attribute of environments of gymnasium's sync and async vector environments, all at once.
-
-        Raises:
-            AttributeError: For any other vector environment, whose environments are not objects of their own.
-        """
-        inner, chosen = self._of_environments(), list(self._get_indices(indices))
-        values = list(inner.get_attr(attr_name)) if len(chosen) < self.num_envs else [None] * self.num_envs
-        for e in chosen:
-            values[e] = value
-        inner.set_attr(attr_name, values)
+        """Raises AttributeError, as `env_method`."""
+        self.env_method(attr_name)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: int | Iterable[int] | None = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method of all environments of gymnasium's sync and async vector environments.
-
-        Raises:
-            AttributeError: For any other vector environment, whose environments are not objects of their own.
-            ValueError: For some of the environments.
-        """
-        if sorted(self._get_indices(indices)) != list(range(self.num_envs)):
-            raise ValueError("gymnasium calls methods of all environments: leave out indices")
-        return list(self._of_environments().call(method_name, *method_args, **method_kwargs))
-
-    def _of_environments(self) -> Any:
-        """Returns gymnasium's vector environment of environments that are objects of their own."""
-        if not isinstance(inner := self.vector_env.unwrapped, _OF_ENVIRONMENTS):
-            raise AttributeError(
-                f"the environments of {type(inner).__name__} are no objects of their own: use vec_env.vector_env"
-            )
-        return inner
+        """Raises AttributeError: environments of a vector are reached through `vector_env`."""
+        raise AttributeError(f"SB3VecEnv reaches no {method_name} of single environments: use vec_env.vector_env")
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper], indices: int | Iterable[int] | None = None
     ) -> list[bool]:
-        """Returns whether a wrapper of that class is around; True for `Monitor`, whose infos this class provides.
-
-        Around the environments of gymnasium's sync vector environments, too; wrappers in other processes are not seen.
-        """
+        """Returns whether a vector wrapper of that class is around; True for `Monitor`, whose infos are provided."""
         wrapped, layer = wrapper_class is Monitor, self.vector_env
         while isinstance(layer, VectorWrapper):
             wrapped |= isinstance(layer, wrapper_class)
             layer = layer.env
-        envs: Any = layer.envs if isinstance(layer, SyncVectorEnv) else [None] * self.num_envs
-        return [
-            wrapped or (envs[e] is not None and is_wrapped(envs[e], wrapper_class)) for e in self._get_indices(indices)
-        ]
+        return [wrapped for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Returns a frame per environment, None where the vector environment renders none."""

@@ -12,13 +12,13 @@ from typing import Any
 
 from gymnasium.vector import VectorEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, EveryNTimesteps
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization, require_kept
 from agents.algorithms import AppliedActionBuffer, build_model, normalized_env
-from agents.callbacks import OTHERS, DualAscentCallback, RegularCallback, SafetyCallback
+from agents.callbacks import OTHERS, DualAscentCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
@@ -28,6 +28,8 @@ from shields.atomic_write import write_atomically
 
 # Observations that the normalization of an agent to go on from counts as.
 KNOWN_STEPS = 100_000
+# An agent that is trained is kept about so often on the way.
+_TIMES = 10
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ def train(
             write_atomically(checkpoints / HISTORY_FILE, history_document(callback.so_far))
 
     if checkpoints is not None:
-        beside.append(RegularCallback(keep))
+        beside.append(EveryNTimesteps(max(steps // _TIMES, 1), ConvertCallback(lambda *_: keep() or True)))
     try:
         model.learn(steps, callback=[*beside, *callbacks], reset_num_timesteps=False)
     except (KeyboardInterrupt, TrainingStopped):

@@ -13,8 +13,9 @@ import numpy as np
 
 from benchmarks.commands import run, table
 from benchmarks.random_plants import under_contracts
-from ncs_gym import ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel, certified_error_set
+from ncs_gym import ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel
 from ncs_gym.envs.env import ncs_env
+from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.registration import registered_ids
 from shields import Certificate, VectorSafetyShield, certificate_for

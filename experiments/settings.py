@@ -17,8 +17,6 @@ from agents.loop import LagrangianSettings
 from ncs_gym.validation import shown
 from shields.runtime.safety_filter import LONGEST_HORIZON
 
-_ADDRESS = re.compile(r"local|auto|[\w.-]+:\d{1,5}|\[[0-9a-fA-F:]+\]:\d{1,5}")
-
 
 def _assignments(texts: list[str]) -> dict[str, Any]:
     """Returns the values by name, each a JSON value or a word such as `lin_0.003`."""
@@ -112,8 +110,6 @@ class BackendSettings:
 
     def __post_init__(self) -> None:
         require_limits(self, jobs=1)
-        if not _ADDRESS.fullmatch(self.ray_address):
-            raise ValueError(f"--ray-address must be local, auto or HOST:PORT, got {self.ray_address!r}")
         if self.engine == "local" and self.ray_address != "local":
             raise ValueError("--ray-address is a setting of --engine ray")
 
@@ -154,8 +150,9 @@ class LearningSettings(BackendSettings):
         certificate: Certificate file to use instead of synthesizing one.
         safe_set: What a synthesized certificate keeps.
         between_samples: Times per step at which the safe box counts; by default the plant's own.
-        channel: Changes of the environment's channel: loss, burst_length (mean number of packets lost in a row), delay,
-            jitter, send_period, quantization_step, max_consecutive_losses.
+        channel: Changes of the environment's channel: loss (of bursts
+            'loss={"p_good_to_bad": 0.1, "p_bad_to_good": 0.3}'), delay, jitter, send_period, quantization_step,
+            max_consecutive_losses.
         hyperparams: Hyperparameters in the words of stable-baselines3, such as gamma=0.99 or
             'policy_kwargs={"net_arch": [64]}'; others are tuned for the environment, or the default.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step; no option of the command line.

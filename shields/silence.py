@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym import LinearPlant, certified_error_set
+from ncs_gym import LinearPlant
+from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.network.channel import in_time
 from ncs_gym.validation import as_count, counted

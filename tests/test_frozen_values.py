@@ -17,42 +17,39 @@ import shields
 from ncs_gym import (
     AdversarialDisturbance,
     Ball,
-    BallDisturbance,
     Bounds,
     Box,
     BoxDisturbance,
     Channel,
     ChannelContract,
     Ellipsoid,
-    FamilyProcess,
     FunctionProcess,
     Gaussian,
     GilbertElliott,
     GymProcess,
     Limits,
-    LinearProcess,
     Model,
     PacketLog,
     Regulation,
     SetpointTracking,
     SinusoidDisturbance,
     SpeedTracking,
-    SphereDisturbance,
     Sum,
     Through,
     TraceChannel,
-    batch_reactor,
     bounds_from_recording,
-    certified_error_set,
     truck_trailer,
 )
 from ncs_gym.envs.loop import Loop
+from ncs_gym.estimation.error_bound import certified_error_set
+from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.processes.cart_pole_process import CartPoleProcess
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
+from ncs_gym.processes.process import FamilyProcess, LinearProcess
 from ncs_gym.registration import TRUCK_TRAILER
 from ncs_gym.rendering.episode_record import Annotation
-from ncs_gym.uncertainty.disturbances import as_disturbance
+from ncs_gym.uncertainty.disturbances import BallDisturbance, SphereDisturbance, as_disturbance
 from ncs_gym.validation import ReadOnlyArrays
 from shields import setpoint_range
 from shields.export.board_table import BoardTable

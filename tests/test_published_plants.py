@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import published as script
 from experiments.commands.attack import attacked, worst_case
-from ncs_gym import certified_error_set
+from ncs_gym.estimation.error_bound import certified_error_set
 from shields.synthesis.resting_point import farthest_from_limits
 from tests.certificates import certificate_of
 from tests.product import altered, linear_plant, vector_env, vector_shield

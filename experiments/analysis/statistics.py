@@ -1,4 +1,4 @@
-"""Confidence intervals, and counts beside the bound on the probability that Gaussian noise leaves the safe set."""
+"""Confidence intervals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Values = Sequence[float] | np.ndarray
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
-# Resamples of a single stratum held in memory at once: it may have thousands of episodes, where strata have runs.
+# Resamples held in memory at once.
 _BATCH = 1_000
 
 
@@ -41,30 +41,22 @@ def interquartile_mean(values: Values, axis: int = -1) -> float:
     return trim_mean(values, 0.25, axis=axis)
 
 
-def bootstrap_interval(*strata: Values, statistic: Callable[..., float] = np.mean) -> list[float] | None:
-    """Returns the percentile bootstrap's 95 % interval of a statistic of all values, each stratum resampled by itself.
+def bootstrap_interval(values: Values, statistic: Callable[..., float] = np.mean) -> list[float] | None:
+    """Returns the percentile bootstrap's 95 % interval of a statistic of values; None for fewer than two.
 
-    With a handful of values it is too narrow: it cannot reach beyond the smallest and the largest of them. To resample
-    the runs within each environment is what Agarwal et al. 2021 do (docs/bibliography.md).
+    With a handful of values it is too narrow: it cannot reach beyond the smallest and the largest of them.
 
     Args:
-        *strata: Independent values of each stratum; a single one is the ordinary bootstrap.
+        values: Independent values.
         statistic: Function of an array of resampled values and the `axis` over which it is computed.
-
-    Returns:
-        The interval; None if a stratum has fewer than two values, or there is none.
     """
-    if not strata or min(map(len, strata)) < 2:
+    if len(values) < 2:
         return None
-
-    def of_all(*resampled: np.ndarray, axis: int) -> float:
-        return statistic(np.concatenate(resampled, axis=axis), axis=axis)
-
     found = bootstrap(
-        [np.asarray(values, np.float64) for values in strata],
-        of_all,
+        [np.asarray(values, np.float64)],
+        statistic,
         n_resamples=RESAMPLES,
-        batch=_BATCH if len(strata) == 1 else RESAMPLES,
+        batch=_BATCH,
         confidence_level=CONFIDENCE,
         method="percentile",
         rng=np.random.default_rng(0),

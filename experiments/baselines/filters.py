@@ -270,17 +270,13 @@ class EstimateFilter(VectorWrapper):
         inner = _environment_behind(env)
         self._plant, self._inputs_of, self._rule = inner.plant, inner.inputs_of, rule
         self._begins_at_once = inner.autoreset_mode is AutoresetMode.SAME_STEP
-        self._begins_next = inner.autoreset_mode is AutoresetMode.NEXT_STEP
-        self._done = self._begun = np.zeros(self.num_envs, np.bool_)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts episodes; see `NCSVectorEnv.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
-        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_)))
-        self._done, self._begun = self._done & ~mask, self._begun | mask
-        self._estimates = info["estimate"].copy()
+        self._estimates, self._begun = info["estimate"].copy(), info["episode_steps"] == 0
         nothing = np.zeros((self.num_envs, self._plant.m))
-        return observation, info | _info(nothing, nothing, self._done & False)
+        return observation, info | _info(nothing, nothing, np.zeros(self.num_envs, np.bool_))
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Steps the environments with the filtered actions.
@@ -290,14 +286,13 @@ class EstimateFilter(VectorWrapper):
         """
         proposed = self._inputs_of(actions).T.copy()
         applied = self._rule(self._estimates, proposed, self._begun)
-        intervened = (applied != proposed).any(axis=1) & ~self._done
+        intervened = (applied != proposed).any(axis=1)
         actions = np.array(actions, np.float64)
         actions[intervened] = (applied[intervened] - self._plant.input_middle) / self._plant.input_half
         observation, rewards, terminated, truncated, info = self.env.step(actions)
-        self._estimates = info["estimate"].copy()
+        self._estimates, self._begun = info["estimate"].copy(), info["episode_steps"] == 0
+        intervened &= self._begins_at_once | ~self._begun  # a step that only resets decides nothing
         applied = np.where(intervened[:, None], applied, proposed)
-        ended = terminated | truncated
-        self._begun, self._done = ended if self._begins_at_once else self._done, ended & self._begins_next
         info = info | _info(applied, proposed, intervened)
         return observation, rewards - self.penalty * intervened, terminated, truncated, info
 

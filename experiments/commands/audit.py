@@ -21,11 +21,9 @@ class AuditSettings:
     """Checks the claims of the paper (Liu et al.) one by one, from its own printed numbers.
 
     Attributes:
-        json: Print JSON instead of the table.
         out: File for the rows (JSON).
     """
 
-    json: bool = False
     out: Path | None = None
 
 
@@ -37,10 +35,9 @@ def audit(settings: AuditSettings) -> None:
     """Runs `ncs audit`."""
     require_place(settings.out)
     claims = list(audited_claims(PaperExample()))
-    document = json.dumps([asdict(claim) for claim in claims], indent=1)
     if settings.out is not None:
-        write_atomically(settings.out, document + "\n")
-    print(document if settings.json else text_of(claims, terminal_width()))
+        write_atomically(settings.out, json.dumps([asdict(claim) for claim in claims], indent=1) + "\n")
+    print(text_of(claims, terminal_width()))
 
 
 def text_of(claims: Sequence[Claim], width: int) -> str:

@@ -11,7 +11,6 @@ import pandas as pd
 import tyro
 
 from agents.agent_file import has_pretrained
-from agents.results import Trajectory
 from experiments.analysis.episodes import (
     arm_summaries,
     episodes_table,
@@ -21,7 +20,7 @@ from experiments.analysis.episodes import (
 )
 from experiments.backends.execution import results_of
 from experiments.baselines import why_aimless
-from experiments.plots.comparison_figures import comparison_figures, most_overridden
+from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import certificate_line, decimals_of, summary_text
 from experiments.runs.arms import Arm, by_arm, full_names, is_any_trained, require_arms, run_of_arm
@@ -105,8 +104,7 @@ def compare(settings: CompareSettings) -> Comparison:
     require_arms(settings, loop, names)
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     claim_folder("compare", settings.completed)
-    plant = ncs_env(loop.single()).plant
-    verification = verify(certificate, plant)
+    verification = verify(certificate, ncs_env(loop.single()).plant)
     print(wrapped(certificate_line(certificate, verification)), flush=True)
     if is_any_trained(settings, names):
         print(*(wrapped(each.agent_line) for each in settings.by_algorithm), sep="\n", flush=True)
@@ -131,13 +129,7 @@ def compare(settings: CompareSettings) -> Comparison:
         if PRETRAINED in settings.arms:
             findings[-1] += " What a shield does, the rows of the pretrained agent show."
 
-    by_name = {(run.arm, run.index): (run, result) for run, result in zip(runs, results, strict=True)}
-
-    def path_of(arm: str, index: int, scenario: str, episode: int) -> Trajectory:
-        run, result = by_name[arm, index]
-        return run.trajectory(result.files, scenario, episode)
-
-    figures = comparison_figures(plant, summary, by_arm(results), most_overridden(episodes, settings.arms, path_of))
+    figures = comparison_figures(summary, by_arm(results))
     certificate.save(settings.out / "certificate.json")
     files = {
         "episodes.parquet": parquet(episodes, summary),

@@ -41,8 +41,6 @@ class RenderSettings:
         certificate: Certificate file to use instead of synthesizing one.
         seed: Seed of the episode (of both, side by side) and of the random policy.
         steps: Largest number of steps.
-        scale: Pixels of a frame per unit of its layout of 640 by 480; by default 2, sharp on dense screens, and
-            1 for a .gif, whose file would be several times as large.
         smoke: Draw a few steps only, to see that everything works; into episode-smoke.gif unless `--out` differs.
     """
 
@@ -55,12 +53,11 @@ class RenderSettings:
     certificate: Path | None = None
     seed: int = 0
     steps: int = 200
-    scale: int | None = None
     smoke: bool = False
 
     def __post_init__(self) -> None:
         require_horizon(self, self.shield)
-        require_limits(self, seed=0, steps=1, scale=(1, 4))
+        require_limits(self, seed=0, steps=1)
         if self.side_by_side and self.shield == "none":
             raise ValueError('--side-by-side compares with a shield: choose a --shield other than "none"')
 
@@ -104,7 +101,7 @@ class _Episode:
         self._env: gym.Env = gym.make(env_id, render_mode="rgb_array")
         inner = ncs_env(self._env)
         assert inner.renderer is not None
-        inner.renderer.scale = settings.scale or (1 if settings.out.suffix == ".gif" else 2)
+        inner.renderer.scale = 1 if settings.out.suffix == ".gif" else 2  # sharp on dense screens, and a larger file
         self._policy = policy_by_name(settings.policy, env_id, inner, settings.seed)
         if mode != "none":
             certificate = None if settings.certificate is None else Certificate.load(settings.certificate)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium as gym
 import matplotlib
@@ -49,27 +50,27 @@ class ReproduceSettings:
 
 # OP is solved at this fraction of the largest feasible scale of the bounds, on a fine grid of kappa and rho.
 _OP_SCALE, _OP_GRID_STEP = 0.9, 0.01
+# Rows of the table.
+_ROWS = (
+    ("steps outside the safe set", "{outside_set:,} of {steps:,}"),
+    ("steps outside the safe box", "{outside_box:,} of {steps:,}"),
+    ("inputs asked beyond the limit", "{input_asked_beyond:,} of {steps:,}"),
+    ("largest x'Mx", "{largest_level:.4f}"),
+    ("largest |K x_hat| [m/s^2]", "{largest_input:.3f}"),
+    ("largest e_up'e_up", "{largest_estimation_error:.5f}"),
+    ("largest e'e", "{largest_error:.5f}"),
+)
 
 
-@dataclass(frozen=True, eq=False)
-class StateFeedback:
-    """A design to simulate: u = K x_hat with the safe set E(L), on a plant with bounds.
-
-    Attributes:
-        name: Name of the design in the table and the figure.
-        plant: The plant, with the bounds that are simulated.
-        box: Distribution of the disturbance.
-        L: Shape of the safe set, shape (2, 2).
-        K: Feedback gain, shape (1, 2).
-        epsilon: Claimed bound on e'e, e = B K e_up; None if the design claims none.
-    """
+class StateFeedback(NamedTuple):
+    """A design to simulate: its name, a plant with bounds and the distribution of disturbances, set, gain, claim."""
 
     name: str
     plant: LinearPlant
     box: BoxDisturbance
-    L: np.ndarray
-    K: np.ndarray
-    epsilon: float | None
+    L: np.ndarray  # shape of the safe set, (2, 2)
+    K: np.ndarray  # gain of u = K x_hat, (1, 2)
+    epsilon: float | None  # claimed bound on e'e, e = B K e_up
 
 
 def reproduce(settings: ReproduceSettings) -> None:
@@ -82,22 +83,9 @@ def reproduce(settings: ReproduceSettings) -> None:
         paths.append(states)
     figure = states_figure(chosen, paths)
     write_results(settings.out, outcomes, figures={"states": (figure.caption, figure.png)})
-    rows = [
-        ("steps outside the safe set", "{outside_set:,} of {steps:,}"),
-        ("steps outside the safe box", "{outside_box:,} of {steps:,}"),
-        ("inputs asked beyond the limit", "{input_asked_beyond:,} of {steps:,}"),
-        ("largest x'Mx", "{largest_level:.4f}"),
-        ("largest |K x_hat| [m/s^2]", "{largest_input:.3f}"),
-        ("largest e'e", "{largest_error:.5f}"),
-        ("claimed epsilon", "{epsilon:.5f}"),
-        ("largest e_up'e_up", "{largest_estimation_error:.5f}"),
-    ]
-
-    def shown(text: str, each: dict[str, float | None]) -> str:
-        return "-" if each["epsilon"] is None and "epsilon" in text else text.format(**each)
-
-    cells = [[name, *(shown(text, each) for each in outcomes.values())] for name, text in rows]
-    print(text_table([["", *outcomes], *cells]))
+    cells = [[name, *(text.format(**each) for each in outcomes.values())] for name, text in _ROWS]
+    claims = ["claimed epsilon", *("-" if each.epsilon is None else f"{each.epsilon:.5f}" for each in chosen)]
+    print(text_table([["", *outcomes], *cells, claims]))
     print(f"files: {settings.out}")
 
 

@@ -10,7 +10,6 @@ import pandas as pd
 
 from experiments.analysis.episodes import arm_summaries, episodes_table, parquet, training_table
 from experiments.backends.execution import results_of
-from experiments.plots.heatmaps import sweep_map
 from experiments.report.text_tables import sweep_table
 from experiments.runs.arms import full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
@@ -27,8 +26,8 @@ class SweepSettings(LearningSettings):
     """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
 
     Every point of the grid is a comparison of its own with the same seeds. Leaves episodes.parquet, summary.json,
-    settings.json, a heatmap of the violating episodes, and the models. Started again with the same folder, finished
-    runs are kept. What all channels have in common is given as --channel.
+    settings.json and the models. Started again with the same folder, finished runs are kept. What all channels have in
+    common is given as --channel.
 
     Attributes:
         out: Output folder; created if it does not exist.
@@ -97,8 +96,7 @@ def sweep(settings: SweepSettings) -> None:
     for name, table in (("episodes", episodes_table), ("training", training_table)):
         rows = pd.concat(table(part, **common, **point) for part, point in zip(parts, points, strict=True))
         files[f"{name}.parquet"] = parquet(rows, summary)
-    figure = sweep_map(cells, settings.arms)
     certificate.save(settings.out / "certificate.json")
-    write_results(settings.out, summary, files, {"violations": (figure.caption, figure.png)})
+    write_results(settings.out, summary, files)
     print(f"{settings.env}: {counted(settings.seeds, 'run')} per arm and channel\n", sweep_table(cells), sep="\n")
     print(f"files: {settings.out}")

@@ -27,8 +27,8 @@ from experiments.paper.counterexample import (
 from experiments.paper.late_packets import STARTS, STEPS, discarded, largest_error, replayed, taken_as_current
 from experiments.paper.paper_example import PaperExample
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
-from shields.paper.bounds import PaperBounds, PaperModel, safety_margin, uplink_error_bound, with_noise
-from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_scale
+from shields.paper.bounds import PaperBounds, PaperModel, safety_margin
+from shields.paper.feasibility import FeasibilityScan, largest_scale
 from shields.paper.optimization_problem import OptimizationProblem
 from shields.verification.rational_matrix import Matrix, to_float
 
@@ -111,8 +111,7 @@ def defects(claims: Sequence[Claim]) -> dict[str, list[int]]:
     return found
 
 
-def discretization(example: PaperExample) -> Claim:
-    """Returns the row about A and B."""
+def _discretization(example: PaperExample) -> Claim:
     plant = example.plant
     gap = max(np.abs(plant.A - example.A).max(), np.abs(plant.B - example.B).max())
     return Claim(
@@ -123,8 +122,8 @@ def discretization(example: PaperExample) -> Claim:
     )
 
 
-def contraction(example: PaperExample) -> Claim:
-    """Returns the row about (C1), with the smallest kappa for which (A+BK)'M(A+BK) <= kappa M."""
+def _contraction(example: PaperExample) -> Claim:
+    """Of (C1), with the smallest kappa for which (A+BK)'M(A+BK) <= kappa M."""
     closed_loop, root = example.closed_loop, np.linalg.cholesky(example.M)
     inner = np.linalg.solve(root, closed_loop.T @ example.M @ closed_loop)
     kappa = float(np.linalg.eigvals(np.linalg.solve(root, inner.T).T).real.max())
@@ -138,8 +137,7 @@ def contraction(example: PaperExample) -> Claim:
     )
 
 
-def margin(example: PaperExample) -> Claim:
-    """Returns the row about (C2)."""
+def _margin(example: PaperExample) -> Claim:
     gamma = example.plant.gamma
     alpha = safety_margin(gamma, example.epsilon, example.kappa)
     smallest = float(np.linalg.eigvalsh(example.L)[0])
@@ -160,8 +158,7 @@ def _misread_alpha(example: PaperExample) -> float:
     return ((example.plant.gamma + example.epsilon**0.5) / (1.0 - example.kappa**0.5)) ** 2
 
 
-def safe_box(example: PaperExample) -> Claim:
-    """Returns the row about (C3)."""
+def _safe_box(example: PaperExample) -> Claim:
     plant, L = example.plant, example.L
     largest = max(float(row @ L @ row) for row in plant.box_rows)
     rounded = max(float(row @ np.linalg.inv(example.M - _PRINTED_DIGITS * np.eye(2)) @ row) for row in plant.box_rows)
@@ -175,26 +172,16 @@ def safe_box(example: PaperExample) -> Claim:
     )
 
 
-def half_input_limit(example: PaperExample) -> Claim:
-    """Returns the row about (C5)."""
-    effort, limit = _effort(example.K, example.L), float(example.plant.u_max[0])
-    return _limited(
-        "(C5) half of the squared input limit covers K x",
-        f"u_max^2 / 2 = {limit**2 / 2:g}",
-        f"K L K' = {effort:.2f}",
-        effort <= limit**2 / 2,
-    )
+def _half_input_limit(example: PaperExample) -> Claim:
+    effort, half = _effort(example.K, example.L), float(example.plant.u_max[0]) ** 2 / 2
+    claim = "(C5) half of the squared input limit covers K x", f"u_max^2 / 2 = {half:g}", f"K L K' = {effort:.2f}"
+    return _limited(*claim, effort <= half)
 
 
-def input_limit(example: PaperExample) -> Claim:
-    """Returns the row about the input that the printed gain asks for."""
-    effort, limit = _effort(example.K, example.L), float(example.plant.u_max[0])
-    return _limited(
-        "the input stays within its limit on the set",
-        f"|u| <= {limit:g}",
-        f"the largest |K x| on the set is {effort**0.5:.2f}, without any estimation error",
-        effort**0.5 <= limit,
-    )
+def _input_limit(example: PaperExample) -> Claim:
+    largest, limit = _effort(example.K, example.L) ** 0.5, float(example.plant.u_max[0])
+    computed = f"the largest |K x| on the set is {largest:.2f}, without any estimation error"
+    return _limited("the input stays within its limit on the set", f"|u| <= {limit:g}", computed, largest <= limit)
 
 
 def _effort(K: np.ndarray, L: np.ndarray) -> float:
@@ -223,8 +210,7 @@ def invariance(example: PaperExample) -> Claim:
     )
 
 
-def reachable_invariance(example: PaperExample) -> Claim:
-    """Returns the row about Definition 3 with the errors that can occur."""
+def _reachable_invariance(example: PaperExample) -> Claim:
     closed_loop, M, ball = example.closed_loop, example.M, Ball(example.plant.gamma)
     reachable = Ball(example.epsilon, along=example.B[:, 0])
     level = worst_step(closed_loop, M, ball, reachable).level
@@ -233,7 +219,7 @@ def reachable_invariance(example: PaperExample) -> Claim:
         "the same for the errors that can occur: e = B K e_up lies in the range of B",
         "x+ in S for all x in S, d, e",
         f"worst x+'M x+ = {level:.3f} with d in the whole ball of (3), if the input is not limited"
-        + (" (that it stays inside is proved in exact arithmetic)" if stays else ""),
+        + (" (proved in exact arithmetic)" if stays else ""),
         Verdict.HOLDS if stays else Verdict.UNDECIDED,
     )
 
@@ -246,23 +232,16 @@ def _text_of(step: OneStep) -> str:
     return f"for example {start} go to x+ = {end} ({confirmed})"
 
 
-def error_bound(example: PaperExample) -> Claim:
-    """Returns the row about epsilon."""
-    plant = example.plant
-    least = PaperModel(plant).at(example.kappa, 1.0).epsilon
-    norm = _gain_norm(example)
-
-    def tight(g2: float) -> float:
-        return norm**2 * uplink_error_bound(plant.gamma, plant.process_noise_cov, plant.initial_cov, plant.delta, g2)
-
+def _error_bound(example: PaperExample) -> Claim:
+    model, norm = PaperModel(example.plant), _gain_norm(example)
+    least, tight = model.at(example.kappa, 1.0).epsilon, example.kappa * float(np.linalg.cond(example.L))
     return Claim(
         "epsilon is the bound of Theorems 2 and 3 at the printed P0, Q, gamma and delta",
         f"epsilon = {example.epsilon}",
         f"with g_bar^2 = kappa rho >= {example.kappa} the theorems give epsilon >= {least:.3f}",
         Verdict.of(least <= example.epsilon),
-        f"with the actual |BK| = {norm:.3f} in place of Theorem 3's bound on it: {tight(example.kappa):.4f} for "
-        f"g_bar^2 = kappa, {tight(example.kappa * float(np.linalg.cond(example.L))):.4f} for kappa cond(L), so the "
-        "printed epsilon is a valid bound once K is known",
+        f"a valid bound once K is known: with the actual |BK| = {norm:.3f} in place of Theorem 3's bound on it "
+        f"{norm**2 * model.epsilon_up(tight):.4f} for g_bar^2 = kappa cond(L)",
         Defect.EPSILON,
     )
 
@@ -271,16 +250,14 @@ def simulated_error(example: PaperExample) -> Claim:
     """Returns the row about the largest error of the paper's simulation."""
     least, norm = PaperModel(example.plant).at(example.kappa, 1.0), _gain_norm(example)
     needed = example.largest_error / norm**2
-    implied = example.epsilon * least.epsilon_up / least.epsilon
-    read_otherwise = example.epsilon / norm**2
+    implied, read_otherwise = example.epsilon * least.epsilon_up / least.epsilon, example.epsilon / norm**2
     return Claim(
         "the largest simulated error agrees with the bounds",
         f"max e'e = {example.largest_error} < epsilon = {example.epsilon}",
         f"it needs e_up'e_up >= {needed:.4f}; the printed epsilon implies at most {implied:.4f} through Theorem 3, but "
         f"up to {read_otherwise:.3f} under the reading of row 9, with the actual |BK|",
         Verdict.HOLDS if needed <= implied else Verdict.UNDECIDED if needed <= read_otherwise else Verdict.FAILS,
-        f"no contradiction under either reading if {example.largest_error} is a norm, not its square (then "
-        f"e_up'e_up >= {example.largest_error**2 / norm**2:.2g})",
+        f"no contradiction under either reading if {example.largest_error} is a norm, not its square",
         Defect.EPSILON,
     )
 
@@ -289,32 +266,24 @@ def _gain_norm(example: PaperExample) -> float:
     return float(np.linalg.norm(example.B @ example.K, 2))
 
 
-def feasibility(example: PaperExample) -> Claim:
-    """Returns the row about OP as printed, and under the most charitable readings of its bounds."""
+def _feasibility(example: PaperExample) -> Claim:
+    """Of OP as printed, and under the most charitable reading of its bounds."""
     plant = example.plant
     scan = FeasibilityScan(plant)
-    best, still = scan.best(plant), scan.best(with_noise(plant, gamma=0.0))
-    fails = best.ratio < 1.0
-    gamma = largest_gamma(scan, with_noise(plant, Q=np.zeros((2, 2))))
-    tail = truncation_energy(1.0 - plant.delta, plant.n)
-    model = PaperModel(plant, quantile=tail)
-    at_tail = scan.best(plant, model)
-    is_feasible = scan.full_ratio(plant, model) >= 1.0
-    epsilon = model.at(at_tail.kappa, at_tail.rho).epsilon
-    q_bar = float(np.linalg.eigvalsh(plant.process_noise_cov)[-1])
-    without = scan.best(plant, PaperModel(plant, q_bar=q_bar, quantile=1.0))
+    best, tail = scan.best(plant), truncation_energy(1.0 - plant.delta, plant.n)
+    fails, model = best.ratio < 1.0, PaperModel(plant, quantile=tail)
+    at_tail, is_feasible = scan.best(plant, model), scan.full_ratio(plant, model) >= 1.0
     return Claim(
         "OP is feasible at the printed parameters",
         "Algorithm 1 returned K and M",
         f"{'in' * fails}feasible under the theorem as printed: over all (kappa, rho) the largest lambda_min(L)/alpha "
-        f"is {best.ratio:.3f} (kappa = {best.kappa:.3f}, rho = {best.rho:.3f}), at least 1 is needed; with gamma = 0 "
-        f"it is {still.ratio:.2f}. OP is feasible with gamma, Q and P0 all scaled by {largest_scale(scan, plant):.3f}; "
-        f"with Q = 0 for gamma <= {gamma:.2g}, a disturbance radius of {gamma**0.5:.4f} against {plant.gamma**0.5:.4f}",
+        f"is {best.ratio:.3f}, at least 1 is needed; feasible with gamma, Q and P0 all scaled by "
+        f"{largest_scale(scan, plant):.3f}",
         Verdict.of(not fails),
         f"with the tail taken at delta instead of 1 - delta (chi2 = {tail:.3f} instead of "
-        f"{plant.process_noise.energy:.2f}), the ratio is {at_tail.ratio:.2f} (kappa = {at_tail.kappa:.2f}, rho = "
-        f"{at_tail.rho:.3f}) and OP is {'' if is_feasible else 'not '}feasible, though with epsilon = {epsilon:.4f} "
-        f"and another K; with q_bar = lambda_max(Q) and no chi-square factor the ratio is {without.ratio:.2f}",
+        f"{plant.process_noise.energy:.2f}), the ratio is {at_tail.ratio:.2f} and OP is "
+        f"{'' if is_feasible else 'not '}feasible, though with epsilon = "
+        f"{model.at(at_tail.kappa, at_tail.rho).epsilon:.4f} and another K",
         Defect.MARGIN,
     )
 
@@ -322,16 +291,14 @@ def feasibility(example: PaperExample) -> Claim:
 def design(example: PaperExample) -> Claim:
     """Returns the row about K and M as the optimum of OP at the printed kappa."""
     asked, limit = (2.0 * _effort(example.K, example.L)) ** 0.5, float(example.plant.u_max[0])
-    printed, other = optimum(example, limit), optimum(example, float(round(asked)))
-    complete = optimum(example, float(round(asked)), with_misread_margin=True)
+    printed, complete = optimum(example, limit), optimum(example, float(round(asked)), with_misread_margin=True)
     reproduced = np.abs(complete[1] - example.K).max() <= _PRINTED_DIGITS
     return Claim(
         f"K and M are the optimum of OP at kappa = {example.kappa}",
         _design_text(example.L, example.K),
         f"without (C2) and (C4), which alpha enters, the optimum at u_max = {limit:g} has {_design_text(*printed)}. As "
-        f"sqrt(2 K L K') = {asked:.3f}, try u_max = {round(asked)}: without them the optimum has "
-        f"{_design_text(*other)}. All of OP with the printed epsilon, but gamma in place of its square root in alpha "
-        f"(alpha = {_misread_alpha(example):.2f}): {_design_text(*complete)}",
+        f"sqrt(2 K L K') = {asked:.3f}, try u_max = {round(asked)}, and gamma in place of its square root in alpha "
+        f"(alpha = {_misread_alpha(example):.2f}): all of OP gives {_design_text(*complete)}",
         Verdict.of(bool(np.abs(printed[1] - example.K).max() <= _PRINTED_DIGITS)),
         f"within the rounding of kappa they are OP's optimum for u_max = {round(asked)} and that alpha: the first "
         "explains rows 5 and 6, the second rows 3 and 7"
@@ -361,8 +328,7 @@ def optimum(example: PaperExample, u_max: float, *, with_misread_margin: bool = 
     if not with_misread_margin:
         rho = 1.0 / example.kappa
     bounds = PaperBounds(example.kappa, rho, epsilon_up, example.epsilon, _misread_alpha(example))
-    problem = OptimizationProblem(plant)
-    found = problem.solution(bounds, with_error=with_misread_margin)
+    found = OptimizationProblem(plant).solution(bounds, with_error=with_misread_margin)
     if found is None:
         raise ArithmeticError(f"the solver found no optimum of OP at u_max = {u_max:g}")
     return found.L, found.K
@@ -448,14 +414,12 @@ def late_packets(example: PaperExample) -> Claim:
         for make in (taken_as_current, discarded, replayed)
     )
     holds = max(current + skipped + again) <= example.epsilon
-    times = min(current) / example.epsilon
     return Claim(
         "the error stays within epsilon with packets that arrive two steps late",
         f"e'e < epsilon = {example.epsilon}, with the filter of Definition 1, which has no late packets",
-        f"simulated with the printed K ({_SEEDS} times {STARTS} starts, {STEPS} steps): if the filter takes late "
-        f"packets as current, max e'e = {min(current):.3f} to {max(current):.3f}, at least {times:.1f} times epsilon; "
-        f"if it discards them, at most {max(skipped):.5f}; a filter that goes back to the step of the sample and "
-        f"replays reaches at most {max(again):.5f}",
+        f"simulated with the printed K ({_SEEDS} times {STARTS} starts, {STEPS} steps): max e'e = {min(current):.3f} "
+        f"to {max(current):.3f} if the filter takes late packets as current; at most {max(skipped):.5f} if it discards "
+        f"them, and {max(again):.5f} if it goes back to the step of the sample and replays",
         Verdict.HOLDS if holds else Verdict.UNDECIDED,
         "" if holds else "the paper does not say what its filter does with a late packet",
     )
@@ -516,22 +480,8 @@ def _half_widths(example: PaperExample) -> np.ndarray:
 
 
 CLAIMS: tuple[Callable[[PaperExample], Claim], ...] = (
-    discretization,  # 1
-    contraction,
-    margin,
-    safe_box,
-    half_input_limit,  # 5
-    input_limit,
-    invariance,
-    reachable_invariance,
-    error_bound,
-    simulated_error,  # 10
-    feasibility,
-    design,
-    margin_at_one,
-    equivalence,
-    disturbance_set,  # 15
-    late_packets,
-    sensor,
-    demonstration,
+    *(_discretization, _contraction, _margin, _safe_box, _half_input_limit),  # 1 to 5
+    *(_input_limit, invariance, _reachable_invariance, _error_bound, simulated_error),  # to 10
+    *(_feasibility, design, margin_at_one, equivalence, disturbance_set),  # to 15
+    *(late_packets, sensor, demonstration),
 )

@@ -1,1 +1,1 @@
-"""Figures of comparisons and sweeps."""
+"""Figures of comparisons."""

@@ -1,45 +1,35 @@
-"""The figures of a comparison: cost and return, training curves, and one episode over time."""
+"""The figures of a comparison: cost and return, and training curves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib
 import numpy as np
-import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from agents.results import Trajectory
 from experiments.plots.figure_style import (
     STYLE,
     ArmStyle,
     CaptionedFigure,
     arm_styles,
-    input_labels,
     label,
     legend_below,
     thousands,
-    with_unit,
 )
 from experiments.runs.arms import Arm, ResultsByArm
 from experiments.runs.loops import AS_TRAINED
 from experiments.runs.training_run import RunResult
-from ncs_gym import LinearPlant
 
-_INK = "#222222"
-_LIMIT = {"color": _INK, "lw": 1.0, "ls": (0, (6.0, 3.0))}
-# Marker sizes of the first and of the last arm [points], and widths of lines: where arms coincide, all are visible.
-_SIZES, _WIDTHS = (12.0, 7.5), (2.6, 1.2)
+# Marker sizes of the first and of the last arm [points]: where arms coincide, all are visible.
+_SIZES = (12.0, 7.5)
 # Panels of the scatter figure beside each other.
 _PANELS = 3
-# What happened in an episode, by the name of the arm.
-_Paths = dict[str, Trajectory]
 # Curves of fewer points show each point.
 _FEW_POINTS = 5
 # The rate of interventions is averaged over this many steps, an episode of 200 in each of 64 environments: it rises and
@@ -47,9 +37,7 @@ _FEW_POINTS = 5
 RATE_WINDOW = 64 * 200
 
 
-def comparison_figures(
-    plant: LinearPlant, summary: dict[str, Any], results: ResultsByArm, shown: ShownEpisode
-) -> dict[str, tuple[str, bytes]]:
+def comparison_figures(summary: dict[str, Any], results: ResultsByArm) -> dict[str, tuple[str, bytes]]:
     """Returns caption and PNG file of every figure by name, what the findings are about first.
 
     There is none of the training where nothing happened in it: no episode was finished, nothing violated or overridden.
@@ -60,7 +48,6 @@ def comparison_figures(
     figures = {"scatter": scatter_figure(summary["arms"], styles)}
     if any(np.isfinite(each.episode_return) or each.violation_steps or each.interventions for each in points):
         figures["training"] = training_figure(trained, styles)
-    figures["episode"] = episode_figure(plant, shown, styles)
     return {name: (figure.caption, figure.png) for name, figure in figures.items()}
 
 
@@ -190,131 +177,3 @@ def _draw_curve(axis: Axes, steps: np.ndarray, values: np.ndarray, style: ArmSty
         axis.fill_between(steps, values.min(axis=0), values.max(axis=0), color=style.color, alpha=0.16, lw=0.0)
     points: dict[str, Any] = style.points if len(steps) < _FEW_POINTS else {}
     axis.plot(steps, values.mean(axis=0), lw=1.9, **style.line, **points)
-
-
-class ShownEpisode(NamedTuple):
-    """The evaluation episode that is drawn, of one or two arms.
-
-    Attributes:
-        run: Number of the run.
-        scenario: Scenario of the evaluation.
-        episode: Number of the episode.
-        paths: What happened in it by the name of the arm, that without a shield first.
-    """
-
-    run: int
-    scenario: str
-    episode: int
-    paths: _Paths
-
-
-def most_overridden(
-    episodes: pd.DataFrame, arms: Sequence[str], path_of: Callable[[str, int, str, int], Trajectory]
-) -> ShownEpisode:
-    """Returns the episode in which a shielded arm is overridden most, beside an arm without a shield if there is one.
-
-    Args:
-        episodes: The table of all episodes.
-        arms: Names of the arms of which it may be.
-        path_of: Returns what happened, given arm, run, scenario and episode.
-    """
-    known = {name: Arm.of(name) for name in arms}
-    shielded = [name for name in arms if known[name].is_shielded]
-    rows = episodes[episodes["arm"].isin(shielded or arms[:1])]
-    row = rows.iloc[int(rows["overridden"].argmax())]
-    bare = [name for name in arms if name not in shielded and name != row["arm"]]
-    bare.sort(key=lambda name: (known[name].policy != known[row["arm"]].policy, name != "unshielded"))
-    at = int(row["run"]), str(row["scenario"]), int(row["episode"])
-    return ShownEpisode(*at, {name: path_of(name, *at) for name in [*bare[: bool(shielded)], str(row["arm"])]})
-
-
-def episode_figure(plant: LinearPlant, shown: ShownEpisode, styles: Mapping[str, ArmStyle]) -> CaptionedFigure:
-    """Returns an evaluation episode of one or two arms over time.
-
-    From above: how close state and estimate come to a limit, a panel per input, and a row of ticks per kind of event.
-    """
-    paths, title = shown.paths, f"Episode {shown.episode} of run {shown.run}, {shown.scenario}"
-    why = ", where the shield overrides most" if any(path.intervened.any() for path in paths.values()) else ""
-    caption = (
-        f"Time series: episode {shown.episode} of run {shown.run} ({shown.scenario}){why}, {' and '.join(paths)}, with"
-        " common random numbers. Above, how close true state and estimate come to the limits: one beyond 1 violates a"
-        " limit. Crosses mark violations, also of limits of inputs and between two samples, which the curve does not"
-        " show. Below, the applied inputs. Ticks mark packet arrivals and interventions; a monitor's are what the"
-        " shield would have done. An episode that is shorter ended at its first violation."
-    )
-    rows = len(paths) + sum(Arm.of(name).mode is not None for name in paths)
-    heights = [1.5, *[1.0] * plant.m, 0.16 + 0.17 * rows]
-    with matplotlib.rc_context(STYLE):
-        figure = CaptionedFigure((11.0, 1.2 + 1.45 * sum(heights)), caption)
-        axes = figure.subplots(2 + plant.m, 1, sharex=True, height_ratios=heights)
-        colors = {name: styles[name].color for name in paths}
-        handles = _draw_states(axes[0], paths, colors, plant)
-        for i in range(plant.m):
-            handles |= _draw_input(axes[1 + i], paths, colors, plant, i)
-        _draw_events(axes[-1], paths, colors, plant)
-        axes[0].set_title(title)
-        label(axes[-1], "time [s]", "")
-        axes[-1].set_xlim(0.0, plant.dt * max(len(path.inputs) for path in paths.values()))
-        figure.align_ylabels(axes[:-1])
-        legend_below(figure, handles, rows=2)
-        return figure
-
-
-def _draw_states(axis: Axes, paths: _Paths, colors: dict[str, str], plant: LinearPlant) -> dict[str, Artist]:
-    """Draws how close states and estimates come to a limit, 1 for one that is reached, and marks the violations."""
-    handles: dict[str, Artist] = {}
-    for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
-        color, time = colors[name], plant.dt * np.arange(len(path.states))
-        true, estimated = (1.0 + plant.constraint_values(x.T).max(axis=0) for x in (path.states, path.estimates))
-        (handles[name],) = axis.plot(time, true, color=color, lw=width)
-        (handles[f"{name}, estimate"],) = axis.plot(time, estimated, color=_INK, lw=1.1, ls=":", zorder=3)
-        if (violating := _violating(path, plant)).any():
-            (cross,) = axis.plot(time[violating], true[violating], "x", color=_INK, ms=4.5, mew=1.0, zorder=4)
-            handles["violation"] = cross
-    handles["limit"] = axis.axhline(1.0, **_LIMIT)
-    label(axis, "", "closest limit")
-    axis.set_ylim(0.0, max(1.12, axis.get_ylim()[1]))
-    return handles
-
-
-def _violating(path: Trajectory, plant: LinearPlant) -> np.ndarray:
-    """Returns which states are outside of a limit, or are those after a step that broke one, shape (T + 1,)."""
-    outside = plant.constraint_values(path.states.T).max(axis=0) > 0.0
-    return outside | np.concatenate([[False], path.violated])
-
-
-def _draw_input(axis: Axes, paths: _Paths, colors: dict[str, str], plant: LinearPlant, i: int) -> dict[str, Artist]:
-    """Draws one input of all arms, and what was proposed in its place."""
-    handles: dict[str, Artist] = {}
-    for (name, path), width in zip(paths.items(), _WIDTHS, strict=False):
-        color, edges = colors[name], plant.dt * np.arange(len(path.inputs) + 1)
-        axis.stairs(path.inputs[:, i], edges, baseline=None, color=color, lw=width)
-        changed = path.intervened & (path.inputs != path.proposed).any(axis=1)
-        if changed.any():
-            middle, proposed = edges[:-1][changed] + 0.5 * plant.dt, path.proposed[changed, i]
-            axis.vlines(middle, path.inputs[changed, i], proposed, color=color, lw=0.7, alpha=0.6)
-            axis.plot(middle, proposed, ".", color=_INK, ms=4.0)
-            handles["proposed, but overridden"] = Line2D([], [], ls="none", marker=".", color=_INK)
-    (middle, half), unit = plant.input_scales[i], plant.input_units[i]
-    for end in plant.input_ends[:, i]:
-        axis.axhline(end, **_LIMIT)
-    axis.set_ylim(middle - 1.15 * half, middle + 1.15 * half)
-    label(axis, "", with_unit(input_labels(plant)[i] + "\n" * bool(unit), unit))
-    return handles
-
-
-def _draw_events(axis: Axes, paths: _Paths, colors: dict[str, str], plant: LinearPlant) -> None:
-    names = []
-    for name, path in paths.items():
-        mode = Arm.of(name).mode
-        rows = [("packet arrivals", 1.0 + np.flatnonzero(path.arrivals), _INK)]
-        if mode is not None:
-            acted = "would override" if mode == "monitor" else "interventions"
-            rows.append((acted, 0.5 + np.flatnonzero(path.intervened), colors[name]))
-        for event, steps, shown in rows:
-            axis.vlines(plant.dt * steps, len(names) - 0.36, len(names) + 0.36, color=shown, lw=1.2)
-            names.append(f"{event}, {name} ({len(steps):,})")
-    axis.set_yticks(range(len(names)), names)
-    axis.set_ylim(-0.6, len(names) - 0.4)
-    axis.tick_params(axis="y", length=0)
-    axis.grid(False)

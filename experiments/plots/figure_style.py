@@ -16,8 +16,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ncs_gym import LinearPlant
-
 # Keys of matplotlib's settings are a type of their own, which plain text is not.
 STYLE: dict[Any, Any] = {
     "font.size": 10,
@@ -64,14 +62,6 @@ class CaptionedFigure(Figure):
 def with_unit(name: str, unit: str) -> str:
     """Returns an axis label; some plants have no units."""
     return f"{name} [{unit}]".replace("^2", _SQUARED) if unit else name
-
-
-def input_labels(plant: LinearPlant) -> tuple[str, ...]:
-    """Returns what the entries of an input are, for axes: names, less the operating point, as "level - 1.16"."""
-    return tuple(
-        f"{name} {'+' if value < 0.0 else '-'} {abs(value):.4g}" if value else name
-        for name, value in zip(plant.input_names, plant.operating_input.tolist(), strict=True)
-    )
 
 
 def label(axis: Axes, x: str, y: str, title: str = "") -> None:

@@ -77,11 +77,6 @@ class Arm:
         return _parsed(name, mode)
 
     @property
-    def is_shielded(self) -> bool:
-        """Whether a shield acts, and so a proof; a monitor only watches, and other filters prove nothing."""
-        return is_shield(self.mode)
-
-    @property
     def is_trained(self) -> bool:
         """Whether an agent is trained."""
         return self.policy == "trained"
@@ -132,7 +127,7 @@ def full_names(names: Sequence[str], settings: LearningSettings) -> tuple[str, .
 
 
 def is_shield(mode: str | None) -> bool:
-    """Returns whether a mode is one of the shield's that protects: not "monitor", and no other filter."""
+    """Returns whether a shield of this mode proves something: a monitor only watches, other filters prove nothing."""
     return mode in _SHIELD_MODES
 
 

@@ -18,12 +18,12 @@ from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.contract import contract_of
 from ncs_gym.registration import needing_extras, registered_ids
-from ncs_gym.validation import counted, warn_caller
+from ncs_gym.validation import warn_caller
 from shields import Certificate, certificate_for
 from shields.verification import require_valid
 
-# Shares of packets that differ by less are the same. Eigenvalues of a chain below this are rounding.
-SHARE, ROUNDING = 1e-3, 1e-12
+# Shares of packets that differ by less are the same.
+_SHARE = 1e-3
 
 
 def registered_env(env_id: str) -> NCSEnv:
@@ -99,29 +99,16 @@ def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
 
     Args:
         own: The environment's own channel.
-        changes: Fields of `Channel` by name; None keeps a value. `burst_length` is the mean number of packets lost in a
-            row (Gilbert-Elliott); losses are independent without it (a mean of 1 / (1 - loss)).
+        changes: Fields of `Channel` by name; None keeps a value.
 
     Raises:
-        ValueError: If a name is unknown or a value out of range, or bursts are asked for without a loss probability, or
-            longer ones than the channel may lose in a row.
+        ValueError: If a name is unknown or a value out of range.
     """
     given = {name: value for name, value in changes.items() if value is not None}
     known = [each.name for each in fields(Channel)]
-    for name in given.keys() - {*known, "burst_length"}:
-        raise ValueError(f"--channel {name}: a channel has no such setting; known are {', '.join(known)}, burst_length")
-    if (length := given.pop("burst_length", None)) is not None:
-        loss = given.get("loss", own.loss)
-        if isinstance(loss, GilbertElliott):
-            raise ValueError("--channel burst_length needs loss, too: the environment's own losses come in bursts")
-        given["loss"] = _bursts(loss, length, given.get("send_period", own.send_period))
+    for name in given.keys() - set(known):
+        raise ValueError(f"--channel {name}: a channel has no such setting; known are {', '.join(known)}")
     changed = replace(own, **given)
-    most = changed.most_consecutive_losses
-    if most is not None and length is not None and length > max(most, 1):
-        raise ValueError(
-            f"--channel burst_length={length:g}: the channel loses at most {counted(most, 'packet')} in a row, and no "
-            "mean is longer; change max_consecutive_losses, too"
-        )
     if "loss" in given and "max_consecutive_losses" not in given and (text := fewer_losses(changed)):
         warn_caller(text, UserWarning)
     return None if changed == own else changed
@@ -130,33 +117,12 @@ def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
 def fewer_losses(channel: Channel) -> str:
     """Returns that a channel loses fewer packets than its losses say, since it loses so many in a row; else nothing."""
     most, wanted = channel.max_consecutive_losses, replace(channel, max_consecutive_losses=None).mean_loss
-    if most is None or channel.mean_loss >= wanted - SHARE:
+    if most is None or channel.mean_loss >= wanted - _SHARE:
         return ""
     return (
         f"{channel.mean_loss:.3g} of the packets are lost in the long run, not {wanted:.3g}: the channel loses at most "
         f"{most} in a row"
     )
-
-
-def _bursts(loss: float, length: float, send_period: int) -> GilbertElliott:
-    """Returns losses of a given probability that come in bursts of a given mean number of packets.
-
-    In the bad state everything is lost. From one packet to the next, M = send_period steps later, it is to be left with
-    probability b = 1/length and entered with a = loss b / (1 - loss); the chain moves every step, so its own
-    probabilities have the same ratio and the M-th root of the eigenvalue 1 - a - b. Raises ValueError if there is none.
-    """
-    usable = 0.0 <= loss < 1.0 and 1.0 <= length < float("inf")
-    left = 1.0 / length if usable else 0.0
-    entered = loss * left / (1.0 - loss) if usable else 2.0
-    eigenvalue = 1.0 - left - entered
-    if send_period > 1 and abs(eigenvalue) < ROUNDING:
-        eigenvalue = 0.0  # independent losses
-    if not usable or entered > 1.0 or (eigenvalue < 0.0 and send_period > 1):
-        raise ValueError(f"no losses of probability {loss} come in bursts of mean length {length}: try a longer one")
-    if send_period > 1:
-        factor = (1.0 - eigenvalue ** (1.0 / send_period)) / (left + entered)
-        left, entered = factor * left, factor * entered
-    return GilbertElliott(p_good_to_bad=entered, p_bad_to_good=left)
 
 
 # The scenario that agents are trained under.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from agents.agent_file import AGENT_FILES
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
-from agents.results import HISTORY_FILE, Episode, Evaluation, TrainingPoint, Trajectory
+from agents.results import HISTORY_FILE, Episode, TrainingPoint
 from experiments.baselines import controller, tuned_weights
 from experiments.runs.loops import AS_TRAINED, import_module, under
 from experiments.runs.provenance import module_digest, registration_of, versions
@@ -217,7 +217,11 @@ class TrainingRun:
                 history=history,
             )
         agent = trained.agent if trained else _agent_of(self)
-        played = {name: self._evaluated(agent, name, on_progress).episodes for name in (AS_TRAINED, *self.scenarios)}
+        safe_set, played = self.certificate.polytope or self.certificate.M, {}
+        for name in (AS_TRAINED, *self.scenarios):
+            loop, policy = under(name, self.loop), _policy(self, agent)  # a random policy begins anew each time
+            found = evaluate(loop, policy, self.episodes, self.evaluation_seed, safe_set, on_progress)
+            played[name] = found.episodes
         return RunResult(
             arm=self.arm,
             index=self.index,
@@ -230,18 +234,6 @@ class TrainingRun:
             scenarios=played,
             went_on_after=self.went_on_after,
         )
-
-    def trajectory(self, files: Mapping[str, bytes], scenario: str, episode: int) -> Trajectory:
-        """Returns an episode of the evaluation of this run, played again with the agent of its result's files."""
-        agent = _agent_of(replace(self, agent_files=dict(files)) if self.trains else self)
-        return self._evaluated(agent, scenario, None, episode).trajectory
-
-    def _evaluated(
-        self, agent: Agent | None, scenario: str, on_progress: Callable[[int], None] | None, shown: int = 0
-    ) -> Evaluation:
-        loop, policy = under(scenario, self.loop), _policy(self, agent)  # a random policy begins anew each time
-        safe_set = self.certificate.polytope or self.certificate.M
-        return evaluate(loop, policy, self.episodes, self.evaluation_seed, safe_set, on_progress, shown)
 
     def _seeds(self, *more: int) -> list[int]:
         """Returns two 31-bit numbers that depend on the experiment's seed and the run's index, not on the arm."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import seeding
 from gymnasium.wrappers import Autoreset
 
 from ncs_gym.envs.episode_channels import EpisodeChannels
@@ -24,6 +25,8 @@ INFOS = (
     *("channel_loss", "channel_delay", "downlink_loss", "downlink_delay"),
 )
 LATE, IDLE = ("apply", "drop", "queue"), ("hold", "neutral")
+# Keeps what the network draws apart from what an environment of the same seed draws.
+NETWORK_STREAM = 0x6E6574
 # What the agent sees instead of an old sample: (newest sample, its age, last actions, oldest first) -> observation.
 Predictor = Callable[[Any, Any, Any], Any]
 
@@ -38,6 +41,7 @@ class NetworkSettings:
 
     Attributes:
         parts: The parts of observations that have a channel of their own.
+        keys: Their keys; None for the whole observation.
         channels: Their channels.
         channel: The only one of them, or a dictionary of them by the keys of their parts.
         downlink: The network of the actions; None for an ideal one.
@@ -62,8 +66,8 @@ class NetworkSettings:
                 raise ValueError(f"{shown(part.space)} has no floats to quantize: leave out quantization_step")
         if len({channel.on_request for channel in self.channels}) > 1:
             raise ValueError("samples are taken on request on all channels or on none")
-        keys = [part.key for part in self.parts]
-        self.channel = self.channels[0] if keys[0] is None else dict(zip(keys, self.channels, strict=True))
+        self.keys = None if self.parts[0].key is None else [part.key for part in self.parts]
+        self.channel = self.by_part(self.channels)
         self.downlink = as_channel(settings["downlink"], "downlink")
         downlink_protocol(self.downlink, None)  # raises where a setting makes no sense there
         self.fill: Any = settings["fill"]
@@ -96,6 +100,18 @@ class NetworkSettings:
             "observe": list(self.entries.names),
         }
 
+    def by_part(self, values: Sequence[Any]) -> Any:
+        """Returns what belongs to the parts by their keys; what belongs to the whole observation alone."""
+        return values[0] if self.keys is None else dict(zip(self.keys, values, strict=True))
+
+    def infos(
+        self, uplinks: list[EpisodeChannels], downlinks: EpisodeChannels, *, many: bool = False
+    ) -> dict[str, Any]:
+        """Returns what infos say of the networks of the present episodes, arrays of N environments."""
+        parts = [links.infos("channel", many=many) for links in uplinks]
+        infos = {name: self.by_part([each[name] for each in parts]) for name in parts[0]}
+        return infos | downlinks.infos("downlink", many=many)
+
     def uplinks(self, count: int) -> list[EpisodeChannels]:
         """Returns the channels of each part in the present episodes of so many environments."""
         return [EpisodeChannels([each] * count, partial(_require_like, each)) for each in self.channels]
@@ -110,12 +126,12 @@ class NetworkSettings:
         Raises:
             ValueError: If it is no channel, or of keys that observations do not have.
         """
-        given, keys = options.pop("channel", None), [part.key for part in self.parts]
-        each = [given] * len(keys)
-        if isinstance(given, Mapping) and keys != [None]:
-            if unknown := [key for key in given if key not in keys]:
-                raise ValueError(f"the option channel has the key {shown(unknown[0])}, the channels' are {keys}")
-            each = [given.get(key) for key in keys]
+        given = options.pop("channel", None)
+        each = [given] * len(self.parts)
+        if isinstance(given, Mapping) and self.keys is not None:
+            if unknown := [key for key in given if key not in self.keys]:
+                raise ValueError(f"the option channel has the key {shown(unknown[0])}, the channels' are {self.keys}")
+            each = [given.get(key) for key in self.keys]
         return [links.read(one, "channel") for one, links in zip(each, uplinks, strict=True)]
 
     def warn_of_lacking_actions(self, age: int) -> None:
@@ -140,7 +156,7 @@ class NetworkSettings:
 
 
 class ReadNetwork:
-    """Mixin of the wrappers: what they are made with is read, and never set."""
+    """Mixin of the wrappers: what they are made with is read, and never set; and what the network draws from."""
 
     channel: Any = setting("channel", "_settings.channel")
     downlink: Channel | None = setting("downlink", "_settings.downlink")
@@ -153,6 +169,20 @@ class ReadNetwork:
     delay_reward: bool = setting("delay_reward", "_settings.delay_reward")
 
     _settings: NetworkSettings
+    _rng: np.random.Generator | None = None
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """What the network draws from; the environment's own draws do not change it."""
+        if self._rng is None:
+            self._rng = seeding.np_random()[0]
+        return self._rng
+
+
+def network_rng(seed: Any) -> np.random.Generator:
+    """Returns what a network draws from; raises ValueError for what is no seed."""
+    number = as_count(seed, "seed", low=0, high=2**64)
+    return np.random.default_rng(np.random.SeedSequence(number, spawn_key=(NETWORK_STREAM,)))
 
 
 def as_channel(value: Any, name: str) -> Channel | None:

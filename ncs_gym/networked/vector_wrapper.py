@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import Space
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Dict, Tuple
-from gymnasium.utils import RecordConstructorArgs, seeding
+from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space, iterate
 
@@ -21,12 +21,13 @@ from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,
     ReadNetwork,
+    network_rng,
     require_action,
     require_no_network,
     require_no_restarts,
 )
 from ncs_gym.networked.observations import is_batched, joined, quantized, snapshot, zero_of
-from ncs_gym.networked.wrapper import network_infos, network_rng, nothing
+from ncs_gym.networked.wrapper import nothing
 from ncs_gym.validation import AroundEnvironments, require_batched_infos, shown
 
 
@@ -99,24 +100,14 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         self._uplinks, self._downlinks = settings.uplinks(self.num_envs), settings.downlinks(self.num_envs)
-        self._rng = None
         self._nothing = settings.neutral if settings.neutral is not None else nothing(env.single_action_space)
         self._keeps_actions = "pending_actions" in settings.entries.names or callable(settings.fill)
         self._started = False
 
     @property
-    def np_random(self) -> np.random.Generator:
-        """What the networks draw from; the environments' own draws do not change it."""
-        if self._rng is None:
-            self._rng = seeding.np_random()[0]
-        return self._rng
-
-    @property
     def episode_channels(self) -> Any:
         """The channels of the present episodes, N of them; with several a dictionary of these."""
-        now = [tuple(links.now) for links in self._uplinks]
-        keys = [part.key for part in self._settings.parts]
-        return now[0] if keys[0] is None else dict(zip(keys, now, strict=True))
+        return self._settings.by_part([tuple(links.now) for links in self._uplinks])
 
     @property
     def episode_downlinks(self) -> tuple[Channel | None, ...]:
@@ -159,7 +150,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
             self._over = self._over & ~chosen  # what is reset now begins no episode in the next step
         else:
             self._make()
-            self._describe()
+            self._network = self._settings.infos(self._uplinks, self._downlinks, many=True)
         self._begin(np.flatnonzero(chosen), snapshot(observations), anew=not everywhere)
         return self._seen(), self._with_network(info)
 
@@ -195,7 +186,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
             if self._actuator is not None:
                 self._actuator.begin(rng, rows, self._downlinks.begin(rng, rows))
             if not all(links.is_plain for links in (*self._uplinks, self._downlinks)):
-                self._describe()
+                self._network = settings.infos(self._uplinks, self._downlinks, many=True)
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
             arrivals.begin(rows, part.of(samples))
         self._steps[rows] = self._packets[rows] = self._action_age[rows] = 0
@@ -204,12 +195,6 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
             self._earned[rows] = self._told[rows] = 0.0
         if self._keeps_actions:
             self._decided[rows] = self._nothing
-
-    def _describe(self) -> None:
-        """Keeps what infos say of the networks of the present episodes."""
-        keys = [part.key for part in self._settings.parts]
-        several = None if keys[0] is None else keys
-        self._network = network_infos(several, self._uplinks, self._downlinks, many=True)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Sends the actions, steps the environments with those that act now, and sees what arrives."""
@@ -276,13 +261,11 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
     def _with_network(self, info: dict[str, Any]) -> dict[str, Any]:
         """Returns the environments' infos with those of the networks."""
         require_no_network(info)
-        keys = [part.key for part in self._settings.parts]
-        ages = [self._steps - each.stamp for each in self._arrivals]
-        arrived = [each.arrived.copy() for each in self._arrivals]
+        by_part = self._settings.by_part
         return {
             **info,
-            "measurement_age": ages[0] if keys[0] is None else dict(zip(keys, ages, strict=True)),
-            "packet_arrived": arrived[0] if keys[0] is None else dict(zip(keys, arrived, strict=True)),
+            "measurement_age": by_part([self._steps - each.stamp for each in self._arrivals]),
+            "packet_arrived": by_part([each.arrived.copy() for each in self._arrivals]),
             "action_age": self._action_age.copy(),
             "action_applied": self._applied.copy(),
             "packets": self._packets.copy(),
@@ -305,18 +288,15 @@ class _Arrivals:
         self.link, self.sample = link, None
         self.stamp, self.arrived = np.zeros(count, np.int64), np.zeros(count, np.bool_)
         self.earned = np.zeros(count)
-        self._is_own = False  # whether these samples were made here, so that nobody else has them
         self._past: list[tuple[Any, np.ndarray | None]] = []
 
     def begin(self, rows: np.ndarray, samples: Any) -> None:
         """Starts episodes in some environments, whose first samples are there."""
         if len(rows) == len(self.stamp):
-            self.sample, self._is_own = samples, False
+            self.sample = samples
         else:
-            if not self._is_own:
-                self.sample = snapshot(self.sample)
+            self.sample = snapshot(self.sample)
             _write(self.sample, samples, rows)
-            self._is_own = True
         self.stamp[rows], self.earned[rows], self.arrived[rows] = 0, 0.0, False
 
     def seen(self) -> Any:
@@ -339,9 +319,7 @@ class _Arrivals:
         for age, arrives in self.link.arrivals():
             stamp, (sample, by_then) = steps - age, self._past[age]
             newer = arrives & (stamp > self.stamp)
-            everywhere = np.count_nonzero(newer) == len(newer)
-            self.sample = sample if everywhere else _where(newer, sample, self.sample)
-            self._is_own = not everywhere
+            self.sample = sample if newer.all() else _where(newer, sample, self.sample)
             self.stamp = np.where(newer, stamp, self.stamp)
             if by_then is not None:
                 self.earned = np.where(newer, by_then, self.earned)

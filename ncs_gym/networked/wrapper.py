@@ -9,10 +9,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.utils import RecordConstructorArgs, seeding
+from gymnasium.utils import RecordConstructorArgs
 
 from ncs_gym.envs.env import NCSEnv
-from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos
 from ncs_gym.network.channel import Channel, require_on_request
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.network.requests import Requests
@@ -20,17 +19,16 @@ from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,
     ReadNetwork,
+    network_rng,
     require_action,
     require_no_network,
     require_no_restarts,
 )
 from ncs_gym.networked.observations import OLDEST_OBSERVED, joined, quantized, snapshot, zero_of
-from ncs_gym.validation import as_count, shown, warn_caller
+from ncs_gym.validation import shown, warn_caller
 
 # Steps after which an agent that may ask for samples is told that nobody does.
 PATIENCE = 10
-# Keeps what the network draws apart from what an environment of the same seed draws.
-NETWORK_STREAM = 0x6E6574
 
 
 class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
@@ -128,26 +126,17 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         self._uplinks, self._downlinks = settings.uplinks(1), settings.downlinks(1)
         on_request = settings.channels[0].on_request
         self._requests = Requests(settings.channels[0], None) if on_request else None
-        self._rng = None
         self._earned = self._told = 0.0
         self._network: Any = None  # what infos say of it in this episode
         self._arrivals = [_Arrivals() for _ in settings.parts]
-        self._keys = [part.key for part in settings.parts] if settings.parts[0].key is not None else None
-        self._sees_newest = self._keys is None and settings.fill == "last" and not settings.entries.names
+        self._sees_newest = settings.keys is None and settings.fill == "last" and not settings.entries.names
         self._observes_actions = "pending_actions" in settings.entries.names
         self._keeps_actions = self._observes_actions or callable(settings.fill)
 
     @property
-    def np_random(self) -> np.random.Generator:
-        """What the network draws from; the environment's own draws do not change it."""
-        if self._rng is None:
-            self._rng = seeding.np_random()[0]
-        return self._rng
-
-    @property
     def episode_channel(self) -> Any:
         """The channel of this episode; with several a dictionary of them."""
-        return self._by_part([links.now[0] for links in self._uplinks])
+        return self._settings.by_part([links.now[0] for links in self._uplinks])
 
     @property
     def episode_downlink(self) -> Channel | None:
@@ -180,7 +169,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         for links, given in zip(every, read, strict=True):
             links.give(given)
             links.begin(rng)
-        self._network = network_infos(self._keys, self._uplinks, self._downlinks)
+        self._network = self._settings.infos(self._uplinks, self._downlinks)
         self._step = self._packets = 0
         sample = snapshot(observation)
         for part, arrivals, links in zip(self._settings.parts, self._arrivals, self._uplinks, strict=True):
@@ -289,41 +278,16 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
     def _with_network(self, info: dict[str, Any], applied: Any, action_age: int) -> dict[str, Any]:
         """Returns the environment's infos with those of the network."""
         require_no_network(info)
-        step, arrivals = self._step, self._arrivals
-        if self._keys is None:
-            age, arrived = step - arrivals[0].stamp, arrivals[0].arrived
-        else:
-            age = self._by_part([step - each.stamp for each in arrivals])
-            arrived = self._by_part([each.arrived for each in arrivals])
+        step, arrivals, by_part = self._step, self._arrivals, self._settings.by_part
         return {
             **info,
-            "measurement_age": age,
-            "packet_arrived": arrived,
+            "measurement_age": by_part([step - each.stamp for each in arrivals]),
+            "packet_arrived": by_part([each.arrived for each in arrivals]),
             "action_age": action_age,
             "action_applied": snapshot(applied),
             "packets": self._packets,
             **deepcopy(self._network),
         }
-
-    def _by_part(self, values: list[Any]) -> Any:
-        return values[0] if self._keys is None else dict(zip(self._keys, values, strict=True))
-
-
-def network_rng(seed: Any) -> np.random.Generator:
-    """Returns what a network draws from; raises ValueError for what is no seed."""
-    number = as_count(seed, "seed", low=0, high=2**64)
-    return np.random.default_rng(np.random.SeedSequence(number, spawn_key=(NETWORK_STREAM,)))
-
-
-def network_infos(
-    keys: list[Any] | None, uplinks: list[EpisodeChannels], downlinks: EpisodeChannels, *, many: bool = False
-) -> dict[str, Any]:
-    """Returns what infos say of the networks of the present episodes; by the keys of the parts, where there are any."""
-    infos = channel_infos(uplinks[0], downlinks, many=many)
-    if keys is not None:
-        parts = [links.infos("channel", many=many) for links in uplinks]
-        infos |= {name: {key: part[name] for key, part in zip(keys, parts, strict=True)} for name in parts[0]}
-    return infos
 
 
 class _Arrivals:

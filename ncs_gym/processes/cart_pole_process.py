@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -49,10 +49,6 @@ class CartPoleProcess(Process):
     def __post_init__(self) -> None:
         for name in ("cart_mass", "pole_mass", "length"):
             object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
-
-    def with_mass(self, factor: float) -> Self:
-        """Returns the process with another mass."""
-        return replace(self, pole_mass=factor * self.pole_mass)
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns the process itself.

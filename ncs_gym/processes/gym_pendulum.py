@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -50,10 +50,6 @@ class PendulumProcess(Process):
     def __post_init__(self) -> None:
         for name in ("gravity", "mass", "length"):
             object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
-
-    def with_mass(self, factor: float) -> Self:
-        """Returns the process with another mass."""
-        return replace(self, mass=factor * self.mass)
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns the opened environments."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -42,10 +42,6 @@ class InvertedPendulumProcess(Process):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mass_factor", as_number(self.mass_factor, "mass_factor", low=0.0, low_open=True))
-
-    def with_mass(self, factor: float) -> Self:
-        """Returns the process with another mass."""
-        return replace(self, mass_factor=factor * self.mass_factor)
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns the opened environments.

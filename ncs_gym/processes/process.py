@@ -108,17 +108,6 @@ class Process:
     def close(self) -> None:
         """Closes what was opened."""
 
-    def with_mass(self, factor: float) -> Process:
-        """Returns the process with another mass, for experiments in which the model is wrong.
-
-        Args:
-            factor: Of the pendulum's or the pole's mass.
-
-        Raises:
-            ValueError: If it has none.
-        """
-        raise ValueError(f"a {type(self).__name__} has no mass to change")
-
 
 @dataclass(frozen=True)
 class LinearProcess(Process):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,23 +28,12 @@ _known_scans: dict[tuple, tuple[tuple[float, float, float], ...]] = {}
 _MAX_KNOWN_SCANS = 4
 
 
-@dataclass(frozen=True)
-class Feasibility:
-    """The feasibility of OP at one point (kappa, rho), without the communication error in the input limit.
-
-    Attributes:
-        ratio: Largest lambda_min(L) / alpha; OP needs at least 1.
-        kappa: Contraction factor.
-        rho: Bound on the condition number of L.
-        eigenvalue: Largest lambda_min(L) under (C1), (C3), (C7) and K_i L K_i' <= u_max^2 / 2.
-        alpha: Lower bound on lambda_min(L) that (C2) demands.
-    """
+class Feasibility(NamedTuple):
+    """Largest lambda_min(L) / alpha at (kappa, rho), without the communication error in the input limit; OP needs 1."""
 
     ratio: float
     kappa: float
     rho: float
-    eigenvalue: float
-    alpha: float
 
 
 class FeasibilityScan:
@@ -89,33 +77,13 @@ class FeasibilityScan:
 
     def _ranked(self, model: PaperModel) -> list[Feasibility]:
         """Returns all points of the scan in order of falling ratio."""
+        if not self._points:
+            raise LookupError("(C1) has no solution at any (kappa, rho)")
         points = []
         for kappa, rho, eigenvalue in self._points:
             alpha = model.at(kappa, rho).alpha
-            ratio = eigenvalue / alpha if alpha > 0.0 else np.inf
-            points.append(Feasibility(ratio, kappa, rho, eigenvalue, alpha))
-        if not points:
-            raise LookupError("(C1) has no solution at any (kappa, rho)")
+            points.append(Feasibility(eigenvalue / alpha if alpha > 0.0 else np.inf, kappa, rho))
         return sorted(points, key=lambda point: -point.ratio)
-
-    def largest(self, plant_at: Callable[[float], LinearPlant], high: float) -> float:
-        """Returns the largest t in [0, high] with OP feasible for plant_at(t), confirmed on all of OP; 0.0 if none is.
-
-        Args:
-            plant_at: Returns the plant, whose uncertainty grows with t.
-            high: A value of t for which OP is infeasible.
-        """
-        low = 0.0
-        if self.best(plant_at(0.0)).ratio < 1.0:
-            return 0.0
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self.best(plant_at(middle)).ratio >= 1.0 else (low, middle)
-        for _ in range(_ATTEMPTS):
-            if self.full_ratio(plant_at(low)) >= 1.0:
-                return low
-            low *= _REDUCTION
-        return 0.0
 
 
 def _scanned(problem: OptimizationProblem) -> tuple[tuple[float, float, float], ...]:
@@ -143,17 +111,21 @@ def _scanned(problem: OptimizationProblem) -> tuple[tuple[float, float, float], 
     return tuple(sorted(points))
 
 
-def largest_gamma(scan: FeasibilityScan, plant: LinearPlant) -> float:
-    """Returns the largest gamma for which OP is feasible, all else being as it is; 0.0 if there is none."""
-    return scan.largest(lambda gamma: with_noise(plant, gamma=gamma), max(plant.gamma, 1e-12))
-
-
 def largest_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
-    """Returns the largest common factor on gamma, Q and P0 for which OP is feasible; 0.0 if there is none."""
+    """Returns the largest common factor on gamma, Q and P0, below 1, with which OP is feasible; 0.0 if none is."""
     gamma, Q, P0 = plant.gamma, plant.process_noise_cov, plant.initial_cov
-    return scan.largest(lambda by: with_noise(plant, gamma=by * gamma, Q=by * Q, P0=by * P0), 1.0)
 
+    def scaled(by: float) -> LinearPlant:
+        return with_noise(plant, gamma=by * gamma, Q=by * Q, P0=by * P0)
 
-def largest_noise_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
-    """Returns the largest factor on Q for which OP is feasible, gamma being as it is; 0.0 if there is none."""
-    return scan.largest(lambda factor: with_noise(plant, Q=factor * plant.process_noise_cov), 1.0)
+    low, high = 0.0, 1.0
+    if scan.best(scaled(low)).ratio < 1.0:
+        return 0.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if scan.best(scaled(middle)).ratio >= 1.0 else (low, middle)
+    for _ in range(_ATTEMPTS):
+        if scan.full_ratio(scaled(low)) >= 1.0:
+            return low
+        low *= _REDUCTION
+    return 0.0

@@ -31,13 +31,11 @@ class OPSolution:
         L: Shape of the safe set, (n, n).
         K: Gain, shape (m, n) [input per state].
         bounds: kappa, rho and the constants of OP at them.
-        log_det: Logarithm of det L.
     """
 
     L: np.ndarray
     K: np.ndarray
     bounds: PaperBounds
-    log_det: float
 
 
 class OptimizationProblem:
@@ -120,8 +118,7 @@ class OptimizationProblem:
         if not np.isfinite(shape).all() or np.linalg.eigvalsh(shape)[0] <= 0.0:
             return None
         K = self._u_max[:, None] * np.linalg.solve(shape, value_of(self._F).T).T / self._size
-        shape = self._size**2 * shape
-        return OPSolution(shape, K, bounds, float(np.linalg.slogdet(shape)[1]))
+        return OPSolution(self._size**2 * shape, K, bounds)
 
     def _at(self, rho: float) -> tuple[cp.Expression, cp.Problem, cp.Problem]:
         """Returns the programs for a rho; (C7) with rho = 1 says L = beta I, which leaves no interior to a matrix L."""

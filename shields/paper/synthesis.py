@@ -1,32 +1,33 @@
-"""The certificate that OP and Algorithm 1 of Liu et al. give, or the reason why there is none."""
+"""Algorithm 1 of Liu et al. and the certificate that it gives, or the reason why there is none."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
 from ncs_gym import LinearPlant
+from ncs_gym.validation import as_number
 from shields.errors import Infeasible
-from shields.paper.algorithm import search_grid
-from shields.paper.bounds import unknown_bounds
-from shields.paper.certificate import PaperCertificate
-from shields.paper.conditions import verify
-from shields.paper.feasibility import FeasibilityScan, largest_gamma, largest_noise_scale, largest_scale
-from shields.paper.optimization_problem import OPSolution
+from shields.paper.bounds import SMALLEST_GAP, PaperModel, unknown_bounds
+from shields.paper.certificate import PaperCertificate, verify
+from shields.paper.feasibility import FeasibilityScan, largest_scale
+from shields.paper.optimization_problem import OPSolution, OptimizationProblem
+
+# Relative tightening of every constraint, so that what the solver returns meets the printed ones in exact arithmetic.
+_SLACK = 1e-7
+# Relative slack that (C2) must have before the tightened problem is solved.
+_REQUIRED_SLACK = 1e-6
 
 
 @np.errstate(all="ignore")
-def synthesize(
-    plant: LinearPlant, *, dkappa: float = 0.02, drho: float = 0.05, search: str = "first"
-) -> PaperCertificate:
-    """Returns the certificate of OP and Algorithm 1 (Liu et al. Definition 4), as printed.
+def synthesize(plant: LinearPlant, *, dkappa: float = 0.02, drho: float = 0.05) -> PaperCertificate:
+    """Returns the certificate of OP and Algorithm 1 (Liu et al. Definition 4), as printed: the first feasible point.
 
     Args:
         plant: The plant with its bounds.
         dkappa: Grid step of kappa, > 0.
         drho: Grid step of rho, > 0.
-        search: "first" feasible grid point, as printed, or "largest" volume over the grid.
 
     Raises:
         Infeasible: If OP has no solution on the grid that meets (C1)-(C7) exactly.
@@ -42,31 +43,56 @@ def synthesize(
     free = plant.n - int(np.linalg.matrix_rank(plant.box_rows))
     if free:
         raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: limit them", "S", free)
-    provenance = {"search": search, "dkappa": dkappa, "drho": drho}
+    for solution in grid_solutions(plant, dkappa, drho):
+        bounds = solution.bounds
+        certificate = PaperCertificate(
+            L=solution.L,
+            K=solution.K,
+            kappa=bounds.kappa,
+            rho=bounds.rho,
+            epsilon=bounds.epsilon,
+            epsilon_up=bounds.epsilon_up,
+            fingerprint=plant.fingerprint,
+            provenance={"source": "Liu et al. Definition 4 and Algorithm 1", "dkappa": dkappa, "drho": drho},
+        )
+        if verify(certificate, plant).valid:
+            return certificate
+    raise _diagnosis(plant)
 
-    def meets_constraints(solution: OPSolution) -> bool:
-        return verify(_certificate(plant, solution, provenance), plant).valid
 
-    try:
-        solution = search_grid(plant, dkappa=dkappa, drho=drho, search=search, accept=meets_constraints)
-    except LookupError:
-        raise _diagnosis(plant) from None
-    return _certificate(plant, solution, provenance)
+def grid_solutions(plant: LinearPlant, dkappa: float = 0.02, drho: float = 0.05) -> Iterator[OPSolution]:
+    """Yields the solutions of OP on the grid of Algorithm 1, in its order.
+
+    Raises:
+        ValueError: If a step is not positive.
+    """
+    problem, model = OptimizationProblem(plant), PaperModel(plant)
+    for point in kappa_rho_grid(dkappa, drho):
+        bounds = model.at(*point)
+        if problem.largest_eigenvalue(bounds) >= bounds.alpha * (1.0 + _REQUIRED_SLACK):
+            solution = problem.solution(bounds, slack=_SLACK)
+            if solution is not None:
+                yield solution
 
 
-def _certificate(plant: LinearPlant, solution: OPSolution, provenance: dict[str, Any]) -> PaperCertificate:
-    """Returns the certificate of a solution of OP, not yet verified."""
-    bounds = solution.bounds
-    return PaperCertificate(
-        L=solution.L,
-        K=solution.K,
-        kappa=bounds.kappa,
-        rho=bounds.rho,
-        epsilon=bounds.epsilon,
-        epsilon_up=bounds.epsilon_up,
-        fingerprint=plant.fingerprint,
-        provenance={"source": "Liu et al. Definition 4 and Algorithm 1", **provenance, "alpha": bounds.alpha},
-    )
+def kappa_rho_grid(dkappa: float, drho: float) -> Iterator[tuple[float, float]]:
+    """Yields (kappa, rho) in the order of Algorithm 1: kappa from 1 down by dkappa, rho from 1 up to 1/kappa by drho.
+
+    Points with kappa rho = 1 are skipped: there the error bound is infinite.
+
+    Raises:
+        ValueError: If a step is not positive.
+    """
+    dkappa, drho = (as_number(v, name, low=0.0, low_open=True) for v, name in ((dkappa, "dkappa"), (drho, "drho")))
+    kappa, i = 1.0, 0
+    while kappa > SMALLEST_GAP:
+        rho, j = 1.0, 0
+        while kappa * rho <= 1.0 - SMALLEST_GAP:
+            yield kappa, rho
+            j += 1
+            rho = 1.0 + j * drho
+        i += 1
+        kappa = 1.0 - i * dkappa
 
 
 def _diagnosis(plant: LinearPlant) -> Infeasible:
@@ -91,25 +117,12 @@ def _diagnosis(plant: LinearPlant) -> Infeasible:
             "grid",
             0.0,
         )
-    gamma, noise, scale = largest_gamma(scan, plant), largest_noise_scale(scan, plant), largest_scale(scan, plant)
+    scale = largest_scale(scan, plant)
     return Infeasible(
         f"OP is infeasible, (C2) binds: over the whole domain the largest lambda_min(L)/alpha is {best.ratio:.3g} (at "
         f"kappa = {best.kappa:.3f}, rho = {best.rho:.3f}) and must be at least 1; it is feasible with "
-        f"gamma, Q and P0 all scaled by {scale:.3g}. {_tolerated(gamma, noise)}",
+        f"gamma, Q and P0 all scaled by {scale:.3g}",
         "C2",
         1.0 - best.ratio,
-        {
-            "ratio": best.ratio,
-            "kappa": best.kappa,
-            "rho": best.rho,
-            "largest_gamma": gamma,
-            "largest_noise_scale": noise,
-            "largest_scale": scale,
-        },
+        {"ratio": best.ratio, "kappa": best.kappa, "rho": best.rho, "largest_scale": scale},
     )
-
-
-def _tolerated(gamma: float, noise: float) -> str:
-    by_gamma = f"enough to lower gamma to {gamma:.3g}" if gamma > 0.0 else "not enough to lower gamma, even to 0"
-    by_noise = f"enough to scale Q by {noise:.3g}" if noise > 0.0 else "not enough to lower Q, even to 0"
-    return f"With Q unchanged it is {by_gamma}; with gamma unchanged it is {by_noise}"

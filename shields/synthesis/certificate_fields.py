@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym import Ellipsoid, ErrorSet, LinearPlant, exact
+from ncs_gym import Ellipsoid, LinearPlant, exact
+from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.plants.hard_bounds import inflated
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import reach_in

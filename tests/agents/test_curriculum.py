@@ -33,7 +33,7 @@ def test_channel_of_a_shield_is_not_set_through_stable_baselines3_or_the_adapter
     shielded = DummyVecEnv([shield])
     with pytest.raises(AttributeError):
         shielded.set_attr("channel", Channel(loss=0.5))
-    with pytest.raises(AttributeError, match="are no objects of their own"):
+    with pytest.raises(AttributeError, match="of single environments"):
         SB3VecEnv(shields()).set_attr("channel", Channel())
 
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from agents import LoopConfig, SB3VecEnv, train
 from ncs_gym import Channel, VectorNetworked, VectorRequestActions
-from shields import SafetyShield, VectorSafetyShield
+from shields import VectorSafetyShield
 from tests.product import vector_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -201,14 +201,11 @@ def test_attributes():
     ):
         with pytest.raises(AttributeError):
             call()
-    with pytest.raises(AttributeError, match=r"are no objects of their own: use vec_env\.vector_env$"):
+    with pytest.raises(AttributeError, match=r"reaches no request of single environments: use vec_env\.vector_env$"):
         env.env_method("request")
-    sync = SB3VecEnv(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
-    sync.set_attr("length", 0.7, indices=1)
-    assert sync.get_attr("length") == [0.5, 0.7]
-    stacked = SB3VecEnv(VectorNetworked(sync.vector_env, Channel(delay=2), observe=("age",)))
+    sync = gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync")
+    stacked = SB3VecEnv(VectorNetworked(sync, Channel(delay=2), observe=("age",)))
     assert stacked.get_attr("channel") == [Channel(delay=2)] * 2
-    assert stacked.get_attr("length") == [0.5, 0.7]
     assert stacked.get_attr("observation_space") == [stacked.observation_space] * 2
     asking = SB3VecEnv(VectorRequestActions(gym.make_vec("ncs_gym/ConvoyOnRequest-v0", num_envs=2)))
     assert asking.get_attr("action_space") == [asking.action_space] * 2
@@ -216,23 +213,9 @@ def test_attributes():
     asking.seed(3)
     asking.reset()
     assert asking.get_attr("np_random_seed") == [3, 3]
-    sync.reset()
-    assert len(sync.env_method("get_wrapper_attr", "length")) == 2
     env.close()
     with pytest.raises(ValueError, match="must be a gymnasium VectorEnv"):
         SB3VecEnv(gym.make("CartPole-v1"))
-
-
-def test_wrappers_around_environments_of_their_own_are_seen():
-    vector = gym.make_vec(CRUISE, num_envs=2, vectorization_mode="sync", wrappers=[SafetyShield])
-    env = SB3VecEnv(vector)
-    for wrapper, is_around in (
-        (SafetyShield, True), (gym.wrappers.TimeLimit, True), (gym.Wrapper, True), (Monitor, True),
-        (gym.wrappers.ClipAction, False),
-    ):  # fmt: skip
-        assert env.env_is_wrapped(wrapper) == [is_around] * 2
-        assert env.env_is_wrapped(wrapper, 1) == [is_around]
-    env.close()
 
 
 def test_evaluate_policy_counts_episodes_by_its_infos():
@@ -290,10 +273,6 @@ class Laps(gym.Env):
         ends = self.steps == 7 + self.lap
         return np.zeros(1, np.float32), 0.0, False, ends, info | ({"end": float(self.steps)} if ends else {})
 
-    def set_scale(self, scale):
-        self.scale = scale
-        return scale
-
 
 @pytest.mark.parametrize("nested", [True, False])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
@@ -310,17 +289,6 @@ def test_infos_are_those_that_each_environment_reported(mode, nested):
             assert {key: mine[key] for key in mine if key != "episode"} == expected
         assert ours.reset_infos == theirs.reset_infos
     assert ends > 6
-
-
-@pytest.mark.parametrize("kind", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
-def test_methods_are_called_of_all_environments(kind):
-    envs = SB3VecEnv(kind([lambda: Laps(2)] * 2), info_keywords=("scale",))
-    envs.reset()
-    with pytest.raises(ValueError, match="calls methods of all environments"):
-        envs.env_method("set_scale", 5.0, indices=[1])
-    assert envs.env_method("set_scale", 4.0) == [4.0, 4.0]
-    assert [info["scale"] for info in envs.step(np.zeros((2, 1)))[3]] == [4.0, 4.0]
-    envs.close()
 
 
 def test_normalization_that_cannot_reset_some_environments_is_refused():

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from agents.loop import LoopConfig, ShieldSettings
-from agents.results import Episode, TrainingPoint, Trajectory
+from agents.results import Episode, TrainingPoint
 from experiments.analysis.episodes import arm_summaries, episodes_table, paired_differences
 from experiments.runs.training_run import RunResult, TrainingRun
 from shields import Certificate
@@ -19,21 +17,6 @@ ALL_ARMS = [
     *(f"shielded{mode}{penalty}" for mode in ("", ":project", ":switch", ":boundary") for penalty in ("", "+penalty")),
     *("penalized:10", "lagrangian", "lookahead", "trusting", "psf:tube", "psf", "shield at test"),
 ]
-
-
-def trajectory(
-    states: np.ndarray,
-    m: int = 1,
-    intervened: tuple[int, ...] = (),
-    arrivals: tuple[int, ...] = (),
-    violated: tuple[int, ...] = (),
-):
-    """A trajectory through states (T + 1, n) whose proposed inputs differ from the applied where it intervened."""
-    steps = len(states) - 1
-    acted, arrived, broken = np.zeros((3, steps), bool)
-    acted[list(intervened)], arrived[list(arrivals)], broken[list(violated)] = True, True, True
-    inputs = np.full((steps, m), 0.5)
-    return Trajectory(states, states + 0.01, inputs, inputs + acted[:, None], acted, arrived, broken)
 
 
 def history(*steps: int, scale: float = 1.0) -> list[TrainingPoint]:

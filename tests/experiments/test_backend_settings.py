@@ -10,11 +10,6 @@ from experiments.settings import BackendSettings, lasting_settings
 from tests.command import assert_one_sentence, ncs
 
 
-@pytest.mark.parametrize("address", ["local", "auto", "head:6379", "my-head.example:6379", "[::1]:1"])
-def test_addresses_of_clusters_are_taken(address):
-    assert BackendSettings(engine="ray", ray_address=address).jobs == 2
-
-
 @pytest.mark.parametrize("command", ["compare", "sweep"])
 def test_ray_missing_is_one_sentence_that_says_what_to_install(command, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed

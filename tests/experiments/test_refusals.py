@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +22,11 @@ from tests.certificates import feasible_age_not_sought
 from tests.command import assert_one_sentence, ncs
 
 NAN, INF = float("nan"), float("inf")
-RAY = partial(BackendSettings, engine="ray")
 HORIZON = "--horizon must be at least 1 and at most 50, got"
 
 SETTINGS = [
     *((kind, {"steps": 0}, "--steps must be at least 1") for kind in (CompareSettings, SweepSettings)),
     *((kind, {"jobs": 0}, "--jobs must be at least 1") for kind in (BackendSettings, CompareSettings)),
-    *((RAY, {"ray_address": text}, "--ray-address must be local, auto or HOST:PORT, got") for text in ("head", "")),
-    (RAY, {"ray_address": "ray://head:10001"}, "--ray-address must be"),
     (BackendSettings, {"ray_address": "auto"}, "--ray-address is a setting of --engine ray"),
     *((CompareSettings, {name: value}, f"--{name.replace('_', '-')} must be")
       for name, value in {"seeds": 0, "steps": -1, "episodes": 0, "seed": -1, "intervention_penalty": -0.1,
@@ -47,23 +43,20 @@ SETTINGS = [
     *((ChannelSettings, {"file": Path("packets.csv"), "sampling_period": period},
        "--sampling-period must be a number > 0") for period in (0.0, -0.02, NAN, INF)),
     *((RenderSettings, {name: value}, words)
-      for name, value, words in [("steps", 0, "--steps must be at least 1"), ("scale", 5, "--scale must be at")]),
+      for name, value, words in [("steps", 0, "--steps must be at least 1")]),
 ]  # fmt: skip
 
 ARMS = ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor", "penalized:", "penalized:-1"]
 ARMS += ["penalized:nan", "penalized:inf", "penalized+penalty", "lagrangian:1", "trusting:project", "psf:switch"]
 ARMS += ["unshielded at test", "at test", "trusting+psf", "unshielded+shielded", "lqr+", "lqr+penalty"]
 ARMS += ["lqr+monitored", "shielded+residual", "+shielded", "K x_hat+K x_hat", "governor", "trusting:7", "mpc:tube"]
-BURSTS = [(0.9, 1.0), (0.5, 0.5), (1.0, 3.0), (-0.1, 2.0), (0.3, NAN), (0.3, INF)]
 
 CALLS = [
     *(((Arm.of, name), "unknown arm .*known are unshielded") for name in ARMS),
     ((scenario_named, "worse"), "unknown scenario 'worse'; known are as trained, worst-case disturbance"),
     ((worse_channel, Channel(), ChannelContract(max_age=0)), "no channel within the contract is worse"),
     ((best_period, Channel(0.5), ChannelContract(3)), "any number of packets"),
-    ((changed_channel, Channel(), {"lag": 3}), "--channel lag: a channel has no such setting; known .*burst_length"),
-    *(((changed_channel, Channel(), {"loss": loss, "burst_length": length}), "bursts of mean length")
-      for loss, length in BURSTS),
+    ((changed_channel, Channel(), {"lag": 3}), "--channel lag: a channel has no such setting; known are loss"),
 ]  # fmt: skip
 
 # Most of these the library shows in a box that reads the command line.
@@ -116,7 +109,6 @@ ONE_SENTENCE = [
     ("train --arm hope", "unknown arm 'hope'"),
     ("evaluate nowhere", "no agent in nowhere"),
     ("evaluate pretrained", "give --env"),
-    ("sweep --losses 0.9 --channel burst_length=2", "bursts of mean length 2"),
     ("train --env ncs_gym/BatchReactor-v0 --channel quantization_step=0.1", "rounds to 0.1, the contract allows 0.001"),
     ("verify nowhere.json", "cannot read certificate nowhere.json"),
     ("synthesize --out no/such/folder/c.json", "No such file or directory"),

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from ncs_gym import (
     AdversarialDisturbance,
     Ball,
-    BallDisturbance,
     Bounds,
     BoxDisturbance,
     Channel,
@@ -29,6 +28,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.envs.env import NCSEnv
+from ncs_gym.uncertainty.disturbances import BallDisturbance
 from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS, examples
 
 PLANT = truck_trailer()

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from benchmarks.random_plants import badly_scaled_plant
 from benchmarks.synthesis import outcome
-from ncs_gym import Channel, ChannelContract, certified_error_set
+from ncs_gym import Channel, ChannelContract
+from ncs_gym.estimation.error_bound import certified_error_set
 from shields import Infeasible
 from tests.fuzz import examples, plants
 from tests.product import loop_env, safety_shield, synthesize

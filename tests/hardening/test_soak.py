@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, Estimator, NCSEnv, Packet, certified_error_set
+from ncs_gym import Channel, NCSEnv, Packet
 from ncs_gym.estimation import arrival_histories
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, histories_of
+from ncs_gym.estimation.error_bound import certified_error_set
+from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from tests.product import loop_env, vector_env
 from tests.shields.attacks.adversary import Traffic

@@ -92,7 +92,7 @@ def oracle(model, u, y, E=None):
 
 
 def test_outputs_alone_bound_disturbances_along_few_directions():
-    model = library_plant(ncs_gym.batch_reactor).model
+    model = library_plant(ncs_gym.plants.batch_reactor.batch_reactor).model
     u, y, s = driven(model, 300, np.array([0.01, 0.02]), 1e-5, E=model.B)
     found = bounds_from_recording(model, u, y, model.B, sensor=1e-5)
     inner = np.abs(s[found.window : -found.window]).max(axis=0)

@@ -64,7 +64,7 @@ def test_past_inputs_are_known_since_delays_and_rates_made_them():
     assert LinearPlant(MODEL, Limits([1.0, 2.0], 1.0), BOUNDS).past == 0
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
 @pytest.mark.parametrize("seed", [3, 10, 18])
 def test_what_the_point_lacks_of_rest_is_inside_where_large_pushes_cancel(seed):
     inner, w = np.random.default_rng(seed).uniform(0.1, 1.0, (2, 2)), np.array([0.3, 0.7])

@@ -9,7 +9,8 @@ import pytest
 from scipy.optimize import linprog
 
 import shields
-from ncs_gym import Channel, ChannelContract, Packet, TraceChannel, certified_error_set
+from ncs_gym import Channel, ChannelContract, Packet, TraceChannel
+from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.network.channel import in_time

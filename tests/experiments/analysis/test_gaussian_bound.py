@@ -9,7 +9,8 @@ from experiments.analysis.episodes import arm_summaries
 from experiments.commands.compare import CompareSettings
 from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
-from ncs_gym import Channel, bound_violation_probability, register_plant
+from ncs_gym import Channel, register_plant
+from ncs_gym.network.gaussian_bound import bound_violation_probability
 from tests.product import linear_plant
 
 # Its safe box is 2 % wider than the bound of its noise: a draw that leaves its ellipsoid by more makes the state leave.

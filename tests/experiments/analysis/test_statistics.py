@@ -64,19 +64,6 @@ def test_interquartile_mean_is_that_of_the_middle_half():
     np.testing.assert_array_equal(interquartile_mean([[0.0, 1.0, 3.0, 9.0], [1.0] * 4], axis=1), [2.0, 1.0])
 
 
-def test_stratified_interval_keeps_the_share_of_every_stratum():
-    # Resampled together, the mean would vary with how often each stratum is drawn.
-    strata = [[0.0, 0.0, 0.0], [100.0, 100.0, 100.0]]
-    assert bootstrap_interval(*strata) == [50.0, 50.0]
-    low, high = bootstrap_interval(np.concatenate(strata))
-    assert high - low > 50.0
-
-
-def test_stratified_interval_needs_two_runs_in_every_stratum():
-    assert bootstrap_interval([1.0, 2.0], [1.0]) is None
-    assert bootstrap_interval() is None
-
-
 @pytest.mark.slow
 def test_hierarchical_interval_covers_what_retraining_changes_and_one_over_episodes_does_not():
     rng, covered, too_narrow = np.random.default_rng(0), [], []

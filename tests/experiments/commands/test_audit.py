@@ -16,19 +16,18 @@ HOLDS, ROUNDED, FAILS, UNDECIDED = Verdict.HOLDS, Verdict.ROUNDED, Verdict.FAILS
 
 @pytest.fixture(scope="module")
 def audit(made_once):
-    """What `ncs audit --json` prints and writes."""
+    """What `ncs audit --out` writes."""
 
     def make(folder):
-        run = succeeded("audit", "--json", "--out", folder / "audit.json")
-        (folder / "printed.json").write_text(run.stdout)
+        succeeded("audit", "--out", folder / "audit.json")
 
     folder = made_once("audit", make)
-    return tuple(json.loads((folder / name).read_text()) for name in ("printed.json", "audit.json"))
+    return json.loads((folder / "audit.json").read_text())
 
 
 @pytest.fixture(scope="module")
 def claims(audit):
-    return [Claim(**claim) for claim in audit[0]]
+    return [Claim(**claim) for claim in audit]
 
 
 EXPECTED = [
@@ -40,12 +39,11 @@ EXPECTED = [
     ("the input", FAILS, ["4.24", "row 12"]),
     ("the set is", FAILS, ["1.0197", "0.924 with e = 0", "d = [0.02, -0.01]", "confirmed in exact arithmetic"]),
     ("the same", HOLDS, ["0.932", "proved in exact arithmetic"]),
-    ("epsilon", FAILS, ["0.149", "0.371", "0.0052 for g_bar^2 = kappa", "0.0056 for kappa cond(L)"]),
+    ("epsilon", FAILS, ["0.149", "0.371", "0.0056 for g_bar^2 = kappa cond(L)"]),
     ("the largest simulated", UNDECIDED, ["0.0124", "0.0024", "0.068", "row 9", "norm"]),
-    ("OP is feasible", FAILS, ["infeasible under the theorem as printed", "0.034", "0.21", "1.6e-05", "0.0040",
-                               "0.0224", "chi2 = 0.103", "1.27", "and OP is feasible, though", "0.84"]),
-    ("K and M", FAILS, ["1.4038, 0.2183", "u_max = 6", "K = [2.0934, 0.3516]", "9.81e-04", "18.00", "5.998",
-                        "K = [2.0927, 0.3514]", "9.84e-04", "17.99"]),
+    ("OP is feasible", FAILS, ["infeasible under the theorem as printed", "0.034", "chi2 = 0.103", "1.27",
+                               "and OP is feasible, though"]),
+    ("K and M", FAILS, ["1.4038, 0.2183", "u_max = 6", "5.998", "K = [2.0927, 0.3514]", "9.84e-04", "17.99"]),
     ("Definition 4", FAILS, ["alpha = 5.7e+06", "0.2904 K", "1.0219", "confirmed in exact arithmetic"]),
     ("Theorem 5", FAILS, ["diag(1, 100)", "diag(0.9, 0)", "radius 0.04", "0.978", "0.81", "1.69"]),
     ("Delta(gamma)", FAILS, ["gamma = 0.0005", "51 %"]),
@@ -115,12 +113,6 @@ def test_summary_counts_rows_and_distinct_defects(claims, monkeypatch):
     assert "Of 18 rows 4 hold (2 of them but for rounding), 10 do not hold, 2 are undecided" in summary
     assert "6 distinct defects" in summary
     assert "(rows 5, 6, 12)" in summary
-
-
-@pytest.mark.slow
-def test_command_prints_json_and_writes_it(audit):
-    printed, written = audit
-    assert printed == written
 
 
 def test_printed_numbers_are_nowhere_else_in_the_code():

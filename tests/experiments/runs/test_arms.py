@@ -7,7 +7,7 @@ from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from benchmarks.suite import NETWORK_TASKS
 from experiments.baselines import EstimateFilter, tuned_training
 from experiments.commands.compare import CompareSettings
-from experiments.runs.arms import Arm, run_of_arm
+from experiments.runs.arms import Arm, is_shield, run_of_arm
 from experiments.runs.loops import certificate_of
 from shields import VectorSafetyShield
 
@@ -53,7 +53,7 @@ def layers(env):
 def test_name_says_which_filter_and_which_policy(name, mode, policy):
     arm = Arm.of(name, "boundary")
     assert (arm.name, arm.mode, arm.policy) == (name, mode, policy)
-    assert arm.is_shielded == (mode is not None and mode.partition(":")[0] not in ("trusting", "psf"))
+    assert is_shield(arm.mode) == (mode is not None and mode.partition(":")[0] not in ("trusting", "psf"))
     assert Arm.of(name.replace(" ", "-"), "boundary") == arm
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from ncs_gym import Channel, ChannelContract, ClippedObservationWarning, Task, cart_pole
+from ncs_gym import Channel, ChannelContract, Task, cart_pole
+from ncs_gym.envs.spaces import ClippedObservationWarning
 from tests.certificates import certificate_of
 from tests.product import linear_plant, loop_env, safety_shield, vector_env
 

@@ -11,24 +11,23 @@ from gymnasium.envs.registration import EnvSpec
 
 from ncs_gym import (
     AdversarialDisturbance,
-    BallDisturbance,
     BoxDisturbance,
     Channel,
     ChannelContract,
     Ellipsoid,
     GilbertElliott,
-    LinearProcess,
     NCSVectorEnv,
     RandomChannel,
     Regulation,
     SetpointTracking,
     SinusoidDisturbance,
     SpeedTracking,
-    SphereDisturbance,
     TraceChannel,
 )
 from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_pole
+from ncs_gym.processes.process import LinearProcess
 from ncs_gym.registration import registered_ids
+from ncs_gym.uncertainty.disturbances import BallDisturbance, SphereDisturbance
 from shields import SafetyShield
 from tests.certificates import certificate_of
 from tests.product import linear_plant, safety_shield

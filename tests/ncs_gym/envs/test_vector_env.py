@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from ncs_gym import BallDisturbance, Ellipsoid, SetpointTracking, SpeedTracking, truck_trailer
+from ncs_gym import Ellipsoid, SetpointTracking, SpeedTracking, truck_trailer
+from ncs_gym.uncertainty.disturbances import BallDisturbance
 from tests.product import library_plant, vector_env
 
 

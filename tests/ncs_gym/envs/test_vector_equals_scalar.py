@@ -12,17 +12,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    Channel,
-    ChannelContract,
-    GilbertElliott,
-    SetpointTracking,
-    SpeedTracking,
-    batch_reactor,
-    cart_pole,
-    truck_trailer,
-)
+from ncs_gym import Channel, ChannelContract, GilbertElliott, SetpointTracking, SpeedTracking, cart_pole, truck_trailer
 from ncs_gym.estimation import arrival_histories
+from ncs_gym.plants.batch_reactor import batch_reactor
 from tests import arrays
 from tests.ncs_gym.envs.same_draws import compare
 from tests.plants import random_plant

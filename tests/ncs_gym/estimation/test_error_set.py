@@ -3,8 +3,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, ErrorSetError, UnstablePlantError, certified_error_set, truck_trailer
-from ncs_gym.estimation.error_bound import require_error_set
+from ncs_gym import Ellipsoid, ErrorSetError, UnstablePlantError, truck_trailer
+from ncs_gym.estimation.error_bound import certified_error_set, require_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.plants import random_plant

@@ -7,24 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.networks import KINDS, gains_taken
-from ncs_gym import (
-    Channel,
-    ChannelContract,
-    Ellipsoid,
-    Estimator,
-    Packet,
-    batch_reactor,
-    cart_pole,
-    certified_error_set,
-    truck_trailer,
-)
+from ncs_gym import Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truck_trailer
 from ncs_gym.estimation.arrival_histories import histories_of
+from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.innovation import quick_test
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, predicted_covariance, updated_covariance
 from ncs_gym.estimation.set_membership import SetMembership, enlarged_by_rounding
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.packet_loss_and_delay import ChannelState
+from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.hard_bounds import FLAT_INFLATION
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant

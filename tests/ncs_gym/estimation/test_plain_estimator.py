@@ -9,22 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ncs_gym import (
-    Channel,
-    ChannelContract,
-    ErrorSetError,
-    Estimator,
-    GilbertElliott,
-    Packet,
-    batch_reactor,
-    cart_pole,
-    certified_error_set,
-    truck_trailer,
-)
+from ncs_gym import Channel, ChannelContract, ErrorSetError, GilbertElliott, Packet, cart_pole, truck_trailer
 from ncs_gym.estimation import arrival_histories
 from ncs_gym.estimation.arrival_histories import histories_of
+from ncs_gym.estimation.error_bound import certified_error_set
+from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.network.packet_loss_and_delay import ChannelState
+from ncs_gym.plants.batch_reactor import batch_reactor
 from tests import arrays
 from tests.fuzz import channels, examples, plants
 from tests.ncs_gym.estimation.plain_estimator import PlainEstimator

@@ -5,7 +5,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, certified_error_set
+from ncs_gym import Channel, ChannelContract, Ellipsoid
+from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.set_membership import SetMembership

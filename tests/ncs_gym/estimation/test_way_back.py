@@ -4,7 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Packet, certified_error_set
+from ncs_gym import Channel, ChannelContract, Packet
+from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.uncertainty.shape_matrices import is_inside

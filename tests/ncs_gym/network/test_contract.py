@@ -12,19 +12,18 @@ from ncs_gym import (
     ErrorSetError,
     GilbertElliott,
     Packet,
-    batch_reactor,
     cart_pole,
-    certified_error_set,
     contract_of,
     truck_trailer,
 )
 from ncs_gym.estimation import kalman_filter, set_membership
 from ncs_gym.estimation.arrival_histories import histories_of
-from ncs_gym.estimation.error_bound import require_error_set
+from ncs_gym.estimation.error_bound import certified_error_set, require_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.network.packet_loss_and_delay import ChannelState
+from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.uncertainty.shape_matrices import is_inside
 from shields.verification.rational_matrix import (
     add,

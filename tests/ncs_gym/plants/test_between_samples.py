@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from ncs_gym import LinearPlant, batch_reactor, cart_pole, truck_trailer
+from ncs_gym import LinearPlant, cart_pole, truck_trailer
+from ncs_gym.plants.batch_reactor import batch_reactor
 from tests.product import altered, sampled_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -173,7 +174,7 @@ def held(**more):
     return sampled_plant(OSCILLATOR, dt=1.5, **PUSHED | {"box": [2.0, 3.0]} | bound | more)
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
 @pytest.mark.parametrize("make", [pushed, held])
 def test_constant_disturbance_is_refused_beside_between_samples(make):
     plant = make()
@@ -186,7 +187,7 @@ def test_constant_disturbance_is_refused_beside_between_samples(make):
     assert make(between_samples=1).fingerprint == LinearPlant.load(document).fingerprint == plant.fingerprint
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
 def test_constant_disturbances_that_cancel_at_the_samples_do_not_within_a_step():
     cancel = {"disturbance_bound": ([[0.0], [0.6]], [-1.0], [0.0])}
     both = ([[0.0, 0.0], [0.6, -0.6]], [0.0, 0.0], [1.0, 1.0])

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import ncs_gym
-from ncs_gym import BoxDisturbance, Ellipsoid, Estimator, truck_trailer
+from ncs_gym import BoxDisturbance, Ellipsoid, truck_trailer
+from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.processes.cart_pole_process import nonlinear_cart_pole
 from ncs_gym.processes.gym_pendulum import pendulum
 from ncs_gym.processes.mujoco_pendulum import inverted_pendulum
@@ -67,7 +68,7 @@ REGISTERED = {
     truck_trailer: "95e3532724d6",
     lambda: truck_trailer(4000.0): "03c8442904a7",
     ncs_gym.cart_pole: "a24fdb2082ae",
-    ncs_gym.batch_reactor: "c4e17ad0a41a",
+    ncs_gym.plants.batch_reactor.batch_reactor: "c4e17ad0a41a",
     pendulum: "8ec05e31669c",
     nonlinear_cart_pole: "bc0bbe28eb93",
     inverted_pendulum: "484e1ba16a42",

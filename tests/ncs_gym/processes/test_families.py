@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ncs_gym import Channel, FamilyProcess, LinearProcess, RandomChannel
+from ncs_gym import Channel, RandomChannel
 from ncs_gym import truck_trailer as truck
-from ncs_gym.processes.process import own_process
+from ncs_gym.processes.process import FamilyProcess, LinearProcess, own_process
 from tests.plants import varying_truck
 from tests.product import family_of, gym_env, library_plant, loop_env, vector_env
 

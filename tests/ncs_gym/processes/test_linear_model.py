@@ -6,9 +6,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, Ellipsoid, FunctionProcess, MovedOperatingPointWarning, NoEquilibriumWarning
+from ncs_gym import Channel, Ellipsoid, FunctionProcess
+from ncs_gym.plants.resting_point import MovedOperatingPointWarning
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
-from ncs_gym.processes.linearization import surrounding_shape
+from ncs_gym.processes.linearization import NoEquilibriumWarning, surrounding_shape
 from tests.certificates import certificate_of
 from tests.product import altered, gym_env, linear_model, safety_shield
 
@@ -76,7 +77,7 @@ def test_linear_process_leaves_nothing_out():
     assert np.sqrt(plant.remainder.bound.shape_matrix.max()) < 1e-9
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.NoEquilibriumWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.processes.linearization.NoEquilibriumWarning")
 @pytest.mark.parametrize("offset", [0.0, 0.02, -0.02])
 def test_proved_bound_holds_what_a_step_from_rest_leaves_out(offset):
     """A kink attains the mean value theorem's bound, and what happens at rest comes on top of that."""

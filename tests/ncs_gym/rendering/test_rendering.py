@@ -19,9 +19,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from agents import SB3VecEnv
-from ncs_gym import Annotation, Channel, Ellipsoid
+from ncs_gym import Channel, Ellipsoid
 from ncs_gym.registration import ENVIRONMENTS, needing_extras
-from ncs_gym.rendering import theme
+from ncs_gym.rendering import Annotation, theme
 from ncs_gym.rendering.episode_record import PacketRecord
 from ncs_gym.rendering.phase_plane import PhasePlane
 from tests.certificates import certificate_of

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from ncs_gym import BallDisturbance, Channel, NCSVectorEnv, bound_violation_probability, truck_trailer
+from ncs_gym import Channel, NCSVectorEnv, truck_trailer
+from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.processes.plant_step import PlantSimulation
+from ncs_gym.uncertainty.disturbances import BallDisturbance
 from tests.product import library_plant, linear_plant, loop_env, vector_env
 
 IDS = ("TruckTrailer", "CartPole")

@@ -6,7 +6,8 @@ import pickle
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, LinearPlant, Remainder
+from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym.uncertainty.remainder import Remainder
 from tests.product import altered, linear_model
 
 ROOM = {"disturbance_bound": 0.0, "sensor_bound": 0.001, "initial_bound": 0.001}

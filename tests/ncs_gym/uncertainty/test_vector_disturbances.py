@@ -8,15 +8,14 @@ import pytest
 
 from ncs_gym import (
     AdversarialDisturbance,
-    BallDisturbance,
     BoxDisturbance,
     Disturbance,
     FunctionProcess,
-    MovedOperatingPointWarning,
     SinusoidDisturbance,
-    SphereDisturbance,
     truck_trailer,
 )
+from ncs_gym.plants.resting_point import MovedOperatingPointWarning
+from ncs_gym.uncertainty.disturbances import BallDisturbance, SphereDisturbance
 from tests.product import library_plant, linear_plant, loop_env, vector_env
 
 IN_M = AdversarialDisturbance(np.array([[2.0, 0.3], [0.3, 1.0]]))

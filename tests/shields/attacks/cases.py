@@ -14,15 +14,14 @@ from ncs_gym import (
     Channel,
     ChannelContract,
     Ellipsoid,
-    FamilyProcess,
     GilbertElliott,
     LinearPlant,
-    Process,
-    batch_reactor,
     cart_pole,
     truck_trailer,
 )
 from ncs_gym.network.contract import contract_of
+from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.processes.process import FamilyProcess, Process
 from shields import Certificate
 from tests.certificates import certificate_of
 from tests.plants import random_plant, servo, varying_cart_pole, varying_truck

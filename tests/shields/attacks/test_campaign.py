@@ -32,7 +32,9 @@ from tests.shields.attacks.worlds import (
     through_shield,
 )
 
-pytestmark = pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning", "ignore::ncs_gym.BrokenContractWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ncs_gym.network.packet_reception.UnusedPacketsWarning", "ignore::ncs_gym.BrokenContractWarning"
+)
 
 MODES = ("project", "switch", "boundary", "lookahead")
 # Environments and steps behind one network in the part, and behind each of them in the whole.

@@ -360,7 +360,7 @@ def test_a_solver_that_fails_means_a_certified_plan_or_the_stored_one(how, monke
 
 
 @pytest.mark.cases(2)
-@pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.network.packet_reception.UnusedPacketsWarning")
 @pytest.mark.parametrize("how", FAILURES)
 def test_no_failure_of_the_solver_leaves_the_box(how, monkeypatch):
     break_solver(monkeypatch, how, np.random.default_rng(0))

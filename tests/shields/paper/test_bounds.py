@@ -3,17 +3,21 @@ import pytest
 from scipy.stats import chi2
 
 from ncs_gym import truck_trailer
-from shields.paper.bounds import (
-    PaperModel,
-    covariance_bound,
-    process_bound,
-    safety_margin,
-    state_error_bound,
-    uplink_error_bound,
-)
+from shields.paper.bounds import PaperModel, safety_margin, state_error_bound, uplink_error_bound
 from tests.product import library_plant
 
 Q, P0 = np.diag([1e-4, 3e-5]), np.diag([2e-4, 1e-4])
+
+
+def covariance_bound(k, p0, g2, q_bar):
+    """p_bar_k of Theorem 1."""
+    return p0 * g2**k + q_bar * sum(g2**i for i in range(k))
+
+
+def uplink(gamma, Q, P0, delta, g2):
+    """eps_up of Theorem 2 from the numbers of a plant."""
+    largest = np.linalg.eigvalsh(P0)[-1], np.linalg.eigvalsh(Q)[-1] + gamma
+    return uplink_error_bound(*largest, chi2.ppf(1.0 - delta, len(Q)), g2, 1.0 - g2)
 
 
 def test_covariance_bound_is_the_recursion_p_plus_is_g2_p_plus_q():
@@ -28,7 +32,7 @@ def test_covariance_bound_bounds_a_covariance_that_is_only_predicted(seed):
     rng = np.random.default_rng(seed)
     G = rng.standard_normal((2, 2))
     G *= 0.9 / np.linalg.norm(G, 2)
-    P, q_bar = P0, process_bound(5e-4, Q)
+    P, q_bar = P0, np.linalg.eigvalsh(Q)[-1] + 5e-4
     for k in range(40):
         assert np.linalg.eigvalsh(P)[-1] <= covariance_bound(k, 2e-4, 0.81, q_bar) * (1 + 1e-12)
         P = G @ P @ G.T + Q + 5e-4 * np.eye(2)
@@ -36,12 +40,12 @@ def test_covariance_bound_bounds_a_covariance_that_is_only_predicted(seed):
 
 def test_uplink_bound_is_theorem_5_with_the_kept_quantile():
     expected = (2e-4 * 0.9 + (1e-4 + 5e-4) / 0.1) * chi2.ppf(0.95, 2)
-    assert uplink_error_bound(5e-4, Q, P0, 0.05, 0.9) == pytest.approx(expected)
+    assert uplink(5e-4, Q, P0, 0.05, 0.9) == pytest.approx(expected)
 
 
 def test_uplink_bound_is_the_limit_of_the_recursion_times_the_quantile():
     far = covariance_bound(3000, 0.0, 0.9, 6e-4) * chi2.ppf(0.95, 2)
-    assert uplink_error_bound(5e-4, Q, np.zeros((2, 2)), 0.05, 0.9) == pytest.approx(far)
+    assert uplink(5e-4, Q, np.zeros((2, 2)), 0.05, 0.9) == pytest.approx(far)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -51,7 +55,7 @@ def test_state_bound_holds_for_every_gain_with_that_closed_loop_norm(seed):
     K = rng.uniform(-2, 2, (1, 2))
     g2 = np.linalg.norm(plant.A + plant.B @ K, 2) ** 2
     e_up = rng.standard_normal(2)
-    bound = state_error_bound(plant.A, g2, float(e_up @ e_up))
+    bound = state_error_bound(np.linalg.norm(plant.A, 2), g2, float(e_up @ e_up))
     assert np.square(plant.B @ K @ e_up).sum() <= bound
 
 
@@ -64,9 +68,9 @@ def test_safety_margin_is_the_distance_argument_of_the_paper():
 def test_model_of_a_plant_agrees_with_the_single_formulas():
     plant = library_plant(truck_trailer, gamma=1e-5, process_noise_cov=Q, initial_cov=P0)
     bounds = PaperModel(plant).at(0.8, 1.1)
-    epsilon_up = uplink_error_bound(1e-5, Q, P0, 0.05, 0.88)
+    epsilon_up = uplink(1e-5, Q, P0, 0.05, 0.88)
     assert bounds.epsilon_up == pytest.approx(epsilon_up)
-    assert bounds.epsilon == pytest.approx(state_error_bound(plant.A, 0.88, epsilon_up))
+    assert bounds.epsilon == pytest.approx(state_error_bound(np.linalg.norm(plant.A, 2), 0.88, epsilon_up))
     assert bounds.alpha == pytest.approx(safety_margin(1e-5, bounds.epsilon, 0.8))
 
 

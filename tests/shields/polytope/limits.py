@@ -6,7 +6,8 @@ import warnings
 
 import numpy as np
 
-from ncs_gym import Channel, LinearPlant, MovedOperatingPointWarning, contract_of
+from ncs_gym import Channel, LinearPlant, contract_of
+from ncs_gym.plants.resting_point import MovedOperatingPointWarning
 from shields import Certificate
 from tests.certificates import certificate_of
 from tests.product import linear_plant, sampled_plant

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.published import contract_of_plant, plant_of
-from ncs_gym import ChannelContract, batch_reactor, certified_error_set
+from ncs_gym import ChannelContract
+from ncs_gym.estimation.error_bound import certified_error_set
+from ncs_gym.plants.batch_reactor import batch_reactor
 from shields import Infeasible
 from shields.synthesis import polytope_certificates
 from shields.synthesis.certification import carried_over, nearby_certificate

@@ -11,7 +11,8 @@ import pytest
 from scipy.optimize import linprog
 
 from benchmarks.published import channel_of, contract_of_plant, plant_of, published
-from ncs_gym import AdversarialDisturbance, ChannelContract, MovedOperatingPointWarning, contract_of
+from ncs_gym import AdversarialDisturbance, ChannelContract, contract_of
+from ncs_gym.plants.resting_point import MovedOperatingPointWarning
 from shields import CertificateError, Infeasible
 from shields.synthesis.invariant_polytope import feedback_of, points_of_box, share_of_points
 from shields.synthesis.tolerance import most_tolerated, tolerated_gains

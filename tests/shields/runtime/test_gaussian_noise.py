@@ -5,7 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, batch_reactor, bound_violation_probability, cart_pole, truck_trailer
+from ncs_gym import Channel, ChannelContract, cart_pole, truck_trailer
+from ncs_gym.network.gaussian_bound import bound_violation_probability
+from ncs_gym.plants.batch_reactor import batch_reactor
 from shields.runtime.guarantee import ALARM
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of

@@ -5,15 +5,8 @@ import pickle
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    Actuator,
-    Channel,
-    ChannelContract,
-    Command,
-    Packet,
-    cart_pole,
-    truck_trailer,
-)
+from ncs_gym import Actuator, Channel, ChannelContract, Packet, cart_pole, truck_trailer
+from ncs_gym.network.actuator import Command
 from shields.runtime.guarantee import (
     ALARM,
     LATE_INPUT,

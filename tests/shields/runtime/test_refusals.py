@@ -13,17 +13,17 @@ from agents import LoopConfig, ShieldSettings
 from ncs_gym import (
     Actuator,
     Channel,
-    Command,
     Ellipsoid,
-    Estimator,
     NCSEnv,
     NCSVectorEnv,
     Packet,
     UnstablePlantError,
     cart_pole,
-    certified_error_set,
     truck_trailer,
 )
+from ncs_gym.estimation.error_bound import certified_error_set
+from ncs_gym.estimation.estimator import Estimator
+from ncs_gym.network.actuator import Command
 from shields import (
     CertificateError,
     SafeLoop,

@@ -6,15 +6,8 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from ncs_gym import (
-    Channel,
-    ChannelContract,
-    Ellipsoid,
-    Packet,
-    UnusedPacketsWarning,
-    cart_pole,
-    truck_trailer,
-)
+from ncs_gym import Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truck_trailer
+from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from shields.runtime.guarantee import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.safe_loop import NOT_STARTED
 from tests.certificates import certificate_of

@@ -14,10 +14,10 @@ from ncs_gym import (
     LinearPlant,
     SpeedTracking,
     TraceChannel,
-    batch_reactor,
     cart_pole,
     truck_trailer,
 )
+from ncs_gym.plants.batch_reactor import batch_reactor
 from shields.runtime import guarantee
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks.published import contract_of_plant, plant_of
-from ncs_gym import ChannelContract, ErrorSetError, certified_error_set
+from ncs_gym import ChannelContract, ErrorSetError
+from ncs_gym.estimation.error_bound import certified_error_set
 from shields import Infeasible
 from tests.certificates import feasible_age_not_sought
 from tests.plants import with_radii

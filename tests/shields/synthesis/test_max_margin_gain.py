@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
-from ncs_gym import ChannelContract, batch_reactor, cart_pole, truck_trailer
+from ncs_gym import ChannelContract, cart_pole, truck_trailer
+from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Infeasible

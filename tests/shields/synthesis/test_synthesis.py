@@ -3,7 +3,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, certified_error_set, truck_trailer
+from ncs_gym import Channel, ChannelContract, truck_trailer
+from ncs_gym.estimation.error_bound import certified_error_set
 from shields import Infeasible, verify
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from tests.certificates import certificate_of, feasible_age_not_sought

@@ -89,7 +89,7 @@ def test_verdict_share_and_tolerated_scale_are_the_same_in_other_units(name, see
     np.testing.assert_allclose(numbers, own_numbers, rtol=0.01)
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
 @pytest.mark.parametrize("seed", range(20))
 def test_middle_of_a_disturbance_rests_at_the_same_point_in_other_units(seed):
     rng = np.random.default_rng(seed)

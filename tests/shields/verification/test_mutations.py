@@ -11,7 +11,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid, LinearPlant, Remainder
+from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym.uncertainty.remainder import Remainder
 from shields import Certificate, CertificateError
 from shields.json_documents import document_of
 from shields.verification import require_valid
