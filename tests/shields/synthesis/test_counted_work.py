@@ -45,7 +45,7 @@ def test_set_that_fails_the_exact_check_is_tightened_and_not_sought_again(loaded
     lines = []
     found = synthesize(loaded, safe_set="ellipsoid", progress=lines.append)
     assert found.provenance["slack"] == 1e-4
-    assert sum(line.startswith("initial design 1 of") for line in lines) == 1
+    assert sum(line.startswith("initial design") for line in lines) == 1
     assert sum(line.startswith("exact verification") for line in lines) == 3
     assert verified(found, loaded).valid
 
@@ -84,7 +84,7 @@ def test_best_certificate_in_time_is_verified_and_says_that_the_time_was_over(lo
     monkeypatch.setattr(search.time, "thread_time", Processor(1.0))
     certificate = synthesize(loaded, time_limit=3.0)
     assert verified(certificate, loaded).valid
-    told = "the synthesis was stopped at initial design 2 of 14, when the time_limit of 3 s was over: other sets may be"
+    told = "the synthesis was stopped at initial design, when the time_limit of 3 s was over: other sets may be"
     assert told in " ".join(str(certificate).split())
 
 
