@@ -78,7 +78,7 @@ def initial_design(
     Sigma = problem.covering_error_shape[None]
     L = min(best.margin**2, _LARGEST_ENLARGEMENT) * best.L
     design = program.solve(best.multipliers, best_input_multipliers(Sigma, L, best.K), L)
-    if design is None:
+    if design is None and len(problem.error_shapes) > 1:
         L = best.margin * best.L
         design = CandidateDesign(L, best.K, best.multipliers, best_input_multipliers(Sigma, L, best.K))
     return design
@@ -103,11 +103,6 @@ def _alternate(
         shifted = shifted_lx, (1.0 - shifted_lx) * shifted_fraction, (1.0 - shifted_lx) * (1.0 - shifted_fraction)
         best = _larger(best, program.solve(shifted, best.inputs, best.L))
     return best
-
-
-def tightened(problem: DesignProblem, design: CandidateDesign, slack: float) -> CandidateDesign | None:
-    """Returns the largest set next to a design, with its multipliers, for a larger slack; None if there is none."""
-    return InvariantSetProgram(problem, slack).solve(design.multipliers, design.inputs, design.L)
 
 
 def with_best_gain(problem: DesignProblem, design: CandidateDesign) -> CandidateDesign:

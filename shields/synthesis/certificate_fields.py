@@ -25,7 +25,7 @@ DIGITS, _SHOWN_DIGITS = 12, 6
 
 
 def certificate_of(
-    plant: LinearPlant, problem: DesignProblem, design: CandidateDesign, errors: ErrorSet, slack: float
+    plant: LinearPlant, problem: DesignProblem, design: CandidateDesign, errors: ErrorSet
 ) -> Certificate:
     """Returns the certificate of a design, not yet verified."""
     L, K = problem.to_physical(design.L, design.K)
@@ -35,7 +35,7 @@ def certificate_of(
         K=K,
         proofs=proofs_of(errors, problem, design),
         **fields_of_problem(plant, problem, errors),
-        provenance=provenance_of(plant, L) | {"slack": slack},
+        provenance=provenance_of(plant, L),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -13,7 +13,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.network.contract import ChannelContract
 from shields.certificate import Certificate
 from shields.errors import Infeasible
-from shields.synthesis.alternating_optimization import ALTERNATIONS, largest_set, tightened, with_best_gain
+from shields.synthesis.alternating_optimization import ALTERNATIONS, largest_set, with_best_gain
 from shields.synthesis.certificate_fields import certificate_of
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, SymmetricLimits, design_problem
 from shields.synthesis.invariant_polytope import feedback_of, limits_within_step
@@ -21,9 +21,8 @@ from shields.synthesis.multipliers import with_best_multipliers
 from shields.synthesis.search import Search
 from shields.verification import Report, verify
 
-# Relative tightenings of the semidefinite programs, tried in turn until the result verifies exactly: the search takes
-# the first, and what it found is tightened by the others.
-SLACKS = (1e-6, 1e-5, 1e-4, 1e-3)
+# Relative tightening of the semidefinite programs, so that the result verifies exactly.
+_SLACK = 1e-6
 # What helps where float64 has too few digits.
 MORE_DIGITS = (
     "give states units in which the half-widths of the box are of similar size, and leave out rows of the box that are "
@@ -54,7 +53,7 @@ def certify(
     """
     problem, errors = design_problem(plant, contract)
     design = _design_at(problem, L, K, _INITIAL_MULTIPLIERS)
-    certificate = replace(certificate_of(plant, problem, design, errors, 0.0), L=L, K=K)
+    certificate = replace(certificate_of(plant, problem, design, errors), L=L, K=K)
     return certificate if verify(certificate, plant).valid else None
 
 
@@ -81,34 +80,30 @@ def largest_ellipsoid(
     Raises:
         Infeasible: If the plant has no design problem, or there is no certificate for a known reason.
     """
-    limits, shrinking = SymmetricLimits(plant.box_rows, plant.u_max), np.ones(len(plant.box_rows))
-    failure: Infeasible | None = None
+    box_rows = plant.box_rows
     for _ in range(_MOST_BOXES):
-        limits = limits._replace(box_rows=limits.box_rows * shrinking[:, None])
-        failure, shrinking = None, np.ones(len(plant.box_rows))
-        for candidate in _candidates(plant, contract, limits, gains, search, start, alternations):
-            shrinking = _over_between_samples(candidate, plant)
-            if shrinking.max() > 1.0:
-                break
-            report = verify(candidate, plant)
-            if report.valid:
-                return candidate
-            failure = failure or _failed_verification(report)
-        if not shrinking.max() > 1.0:
+        limits = SymmetricLimits(box_rows, plant.u_max)
+        candidate = _candidate(plant, contract, limits, gains, search, start, alternations)
+        over = None if candidate is None else _over_between_samples(candidate, plant)
+        if over is None or over.max() <= 1.0:
             break
-    widest = float(np.abs(limits.box_rows * shrinking[:, None]).max() / np.abs(plant.box_rows).max())
-    if widest > 1.0:  # there is a set in the plant's own box
-        raise _leaves_between_samples(widest - 1.0)
-    if failure is not None:
-        raise failure
-    spread = float(plant.half_widths.max() / plant.half_widths.min())
-    if spread > _WIDEST_SPREAD:
+        box_rows = box_rows * over[:, None]
+    else:
+        candidate = None
+    if candidate is not None:
+        report = verify(candidate, plant)
+        if report.valid:
+            return candidate
+        raise _failed_verification(report)
+    if (widest := float(np.abs(box_rows).max() / np.abs(plant.box_rows).max())) > 1.0:
+        raise _leaves_between_samples(widest - 1.0)  # there is a set in the plant's own box
+    if (spread := float(plant.half_widths.max() / plant.half_widths.min())) > _WIDEST_SPREAD:
         what = f"the plant is too ill-conditioned for this search, its half-widths differ by a factor of {spread:.0e}"
         raise Infeasible(f"{what}: {MORE_DIGITS}", "I", 1.0)
     return None
 
 
-def _candidates(
+def _candidate(
     plant: LinearPlant,
     contract: ChannelContract | None,
     limits: SymmetricLimits,
@@ -116,8 +111,8 @@ def _candidates(
     search: Search,
     start: Certificate | None,
     alternations: int,
-) -> Iterator[Certificate]:
-    """Yields certificates of the largest set within limits, not yet verified, one slack after the other."""
+) -> Certificate | None:
+    """Returns the certificate of the largest set within limits, not yet verified; None if no set is found."""
     search("error set")
     problem, errors = design_problem(plant, contract, limits)
     near = None
@@ -125,19 +120,18 @@ def _candidates(
         lx, le, ld = shares.tolist()
         near = _design_at(problem, start.L, start.K, (lx, le, ld))
 
-    def certificate(design: CandidateDesign, slack: float) -> Certificate:
-        return certificate_of(plant, problem, with_best_gain(problem, design), errors, slack)
+    def certificate(design: CandidateDesign) -> Certificate:
+        return certificate_of(plant, problem, with_best_gain(problem, design), errors)
 
     def report(stage: str, design: CandidateDesign) -> None:
-        search.candidate = partial(certificate, design, SLACKS[0])
+        search.candidate = partial(certificate, design)
         search(f"{stage}: {math.exp(0.5 * design.log_det):.4f} of the box ellipsoid's volume")
 
-    found = largest_set(problem, SLACKS[0], report, gains, near, alternations)
-    for slack in SLACKS:
-        design = found if found is None or slack == SLACKS[0] else tightened(problem, found, slack)
-        if design is not None:
-            report("exact verification", design)
-            yield certificate(design, slack)
+    found = largest_set(problem, _SLACK, report, gains, near, alternations)
+    if found is None:
+        return None
+    report("exact verification", found)
+    return certificate(found)
 
 
 def _design_at(
