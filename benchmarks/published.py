@@ -1,13 +1,15 @@
 """What certificates keep of plants that people published: `python -m benchmarks.published COMMAND`.
 
-Commands: shares, attack.
+Commands: shares, attack, impossible.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import Counter
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from scipy.optimize import linprog
 
 from benchmarks.commands import run, table
 from experiments.commands.attack import attacked, channels_of, worst_case
-from ncs_gym import Bounds, Box, Channel, ChannelContract, Limits, LinearPlant, Model, NCSVectorEnv, Through
+from ncs_gym import Bounds, Box, Channel, ChannelContract, Ellipsoid, Limits, LinearPlant, Model, NCSVectorEnv, Through
 from ncs_gym.model import zero_order_hold
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, Infeasible, VectorSafetyShield, reach_of, synthesize, verify
@@ -27,6 +29,8 @@ from shields.synthesis.invariant_polytope import points_of_box
 
 # From so many points, a power of two, inputs are sought that keep the limits for so many steps.
 _POINTS_LOG2, _STEPS = 9, 60
+# After so many samples errors that are hidden in noise are sought.
+_CYCLES = (1, 2, 4, 8, 16, 32)
 _SIDES = {"low": -np.inf, "high": np.inf}
 Names = tyro.conf.Positional[tuple[str, ...]]
 
@@ -41,7 +45,8 @@ def plant_of(name: str) -> LinearPlant:
     """Returns a published plant with its limits as they are.
 
     Disturbances of a model in continuous time are constant over a step. Where no state has a published limit, all have
-    those that the file invents.
+    those that the file invents. The smallest ellipsoid around a box of first errors suits each state alike; where
+    another one is needed, the file has its half-axes.
     """
     p = published()[name]
     A, n, dt = np.array(p["A"]), len(p["A"]), p["dt"]
@@ -59,10 +64,11 @@ def plant_of(name: str) -> LinearPlant:
     ]
     made = Model.sampled if is_continuous else Model
     disturbance = Through(E, Box(p["disturbance_low"], p["disturbance_high"]))
+    first, axes = p["first_error_half_widths"], p.get("first_error_half_axes")
     return LinearPlant(
         made(A, p["B"], p["C"], dt, (state, p["operating_input"])),
         Limits((low, high), (p["input_low"], p["input_high"]), outputs),
-        Bounds(disturbance, sensor=p["sensor_half_widths"], first_error=p["first_error_half_widths"]),
+        Bounds(disturbance, p["sensor_half_widths"], first if axes is None else Ellipsoid(np.diag(np.square(axes)))),
     )
 
 
@@ -134,6 +140,66 @@ def attack(names: Names = (), steps: int = 45_000) -> None:
     print(f"{outside} of {total['steps']:,} attacked steps left a set or broke a limit")
 
 
+def impossible(names: Names = ("ctms_suspension", "double_integrator", "tvc_rocket", "bap_gepoc")) -> None:
+    """From which multiple of its declared bounds on no controller at all keeps the limits of a plant, in exact numbers.
+
+    Of smaller multiples it says nothing: a certificate alone shows that they are borne.
+    """
+    show = table("plant", "impossible beyond", first=18, width=18)
+    for name in names:
+        p = published()[name]
+        least = impossible_beyond(plant_of(name), np.array(p["first_error_half_widths"]), p["max_age"] + 1)
+        show(name, f"{math.ceil(1e3 * least) / 1e3:.3f}" if least < np.inf else "unknown")
+
+
+def impossible_beyond(plant: LinearPlant, first: np.ndarray, period: int) -> Fraction | float:
+    """Returns a multiple of all bounds beyond which no controller keeps the box of a plant; infinite if none is found.
+
+    A sample comes every `period` steps. Let errors e follow from a first one and from disturbances, hidden in the noise
+    by each sample, |H e| <= v. Then they and their opposites give the same outputs, hence the same inputs, and states
+    that differ by 2 e just before the next sample: in one of the two cases a row c of a range below 2 c e is left.
+    Linear programs find large c e. What these are, and what part of the bounds they take, is computed without rounding.
+
+    Args:
+        plant: The plant, disturbed by a box through a matrix, with sensor noise in a box.
+        first: Half-widths of the first error, shape (n,).
+        period: The contract's largest age and one more [steps].
+    """
+    disturbance, sensor = plant.bounds.disturbance.parts[0], plant.bounds.sensor.parts[0]
+    values = plant.A, plant.H, np.diag(first), disturbance.E, np.diag(disturbance.set.half), sensor.half
+    exact_values = [np.vectorize(Fraction, otypes=[object])(each) for each in values]
+    least = np.inf
+    for steps in (period * cycles for cycles in _CYCLES):
+        units = np.eye(plant.n + steps * disturbance.E.shape[1])  # of the first error, then of every disturbance
+        error, hidden = _errors(values, units, period)
+        for row, low, high in zip(plant.box, *plant.box_ends, strict=True):
+            found = linprog(-row @ error, np.vstack([hidden, -hidden]), np.ones(2 * len(hidden)), bounds=(-1.0, 1.0))
+            if np.isfinite(high - low) and found.status == 0 and found.fun < 0.0:
+                numbers = np.vectorize(Fraction, otypes=[object])(found.x)
+                reached, shown = _errors(exact_values, numbers, period)
+                taken = max(map(abs, [*numbers, *shown]))
+                reach = sum(Fraction(c) * e for c, e in zip(row, reached, strict=True))
+                least = min(least, (Fraction(high) - Fraction(low)) * taken / (2 * reach))
+    return least
+
+
+def _errors(values: Any, numbers: np.ndarray, period: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the error that parts of the bounds make in the end, shape (n, ...), and what each sample shows of it.
+
+    Args:
+        values: A, H, diagonal matrix of the first error's bounds, E, such a matrix of disturbances, bounds of noise.
+        numbers: Parts of the bounds, in [-1, 1]: of the first error, then of the disturbance in each step.
+        period: A sample comes every so many steps.
+    """
+    A, H, first, E, half, noise = values
+    error, shown = first @ numbers[: len(A)], []
+    for step, part in enumerate(numbers[len(A) :].reshape(-1, E.shape[1], *numbers.shape[1:])):
+        if step % period == 0:
+            shown.append(((H @ error).T / noise).T)
+        error = A @ error + E @ (half @ part)
+    return error, np.concatenate(shown)
+
+
 def certified(name: str, plant: LinearPlant) -> Certificate:
     """Returns a certificate of a published plant that verifies; raises Infeasible if none is found."""
     certificate = synthesize(plant, contract=contract_of_plant(name))
@@ -168,7 +234,7 @@ def largest_share(plant: LinearPlant) -> float | None:
     return kept / len(points)
 
 
-COMMANDS = (shares, attack)
+COMMANDS = (shares, attack, impossible)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

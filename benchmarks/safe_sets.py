@@ -296,7 +296,7 @@ def between_samples(ids: Sequence[str] = tuple(POINTS), points: int = 0, steps: 
 
     Each id has two lines: at sampling instants alone, and at all times. "S" and "P" are the shares of the safe box's
     volume that ellipsoid and polytope fill, "rows" those of P, "s" the time of both searches and proofs, "bears" how
-    much larger all disturbances and errors could be for some ellipsoid ("tolerated_scale"). "overridden" and "reward"
+    much larger all disturbances and errors could be for some set ("tolerated_scale"). "overridden" and "reward"
     (per step) are those of an LQR behind the shield with P in mode "project", in the same episodes. "left" is the
     largest |c x| between two samples inside the box, without a shield, under random inputs of full size. "decision",
     "step" and "x 64" (steps of 64 environments) are times, least of many in turns, next to those of the first line.

@@ -1,16 +1,19 @@
 """Published plants under attack: limits with two ends and limits of rates, and what share of a box could be kept."""
 
 from collections import Counter
+from fractions import Fraction
 
 import numpy as np
 import pytest
 
 from benchmarks import published as script
 from experiments.commands.attack import attacked, worst_case
+from ncs_gym import Bounds, Box, ChannelContract, Limits, LinearPlant, Model, Through
 from ncs_gym.estimation.error_bound import certified_error_set
+from shields import Infeasible
 from shields.synthesis.resting_point import farthest_from_limits
-from tests.certificates import certificate_of
-from tests.product import altered, linear_plant, vector_env, vector_shield
+from tests.certificates import certificate_of, feasible_age_not_sought
+from tests.product import altered, linear_plant, synthesize, vector_env, vector_shield
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS
 
 
@@ -51,6 +54,31 @@ def test_largest_share_is_where_an_input_can_still_turn_the_state_round():
     plant = linear_plant(A=np.diag([1.25, 0.5]), B=np.eye(2, 1), box=np.diag([0.1, -1.0]), u_max=1.0, **exact)
     assert script.largest_share(plant) == pytest.approx(0.4, abs=0.01)
     assert script.largest_share(altered(plant, box=np.array([[0.1, 0.0]]))) is None
+
+
+def test_no_controller_bears_what_noise_hides_and_a_certificate_bears_less():
+    """x+ = x + u + d, |d| <= .2, |v| <= .1 under |x| <= 1: two steps after a sample x is known to .1 + 2 (.2)."""
+
+    def bounded_by(scale):
+        bounds = Bounds(Through(np.eye(1), Box([-0.2 * scale], [0.2 * scale])), [0.1 * scale], [0.1 * scale])
+        return LinearPlant(Model([[1.0]], [[1.0]], [[1.0]], 0.1), Limits([1.0], [10.0]), bounds)
+
+    most = script.impossible_beyond(bounded_by(1.0), np.array([0.1]), 2)
+    assert isinstance(most, Fraction)
+    assert float(most) == pytest.approx(2.0, rel=1e-9)
+    assert synthesize(bounded_by(1.8), contract=ChannelContract(1))
+    with pytest.raises(Infeasible):
+        synthesize(bounded_by(2.01), contract=ChannelContract(1))
+
+
+def test_plant_has_a_certificate_with_another_ellipsoid_around_its_first_error():
+    """The smallest one around the box of first errors leaves nothing of the limits of the ball and plate."""
+    plant, p = script.plant_of("bap_gepoc"), script.published()["bap_gepoc"]
+    box = np.array(p["first_error_half_widths"])
+    assert np.square(box / np.array(p["first_error_half_axes"])).sum() <= 1.0
+    assert script.certified("bap_gepoc", plant)
+    with feasible_age_not_sought(), pytest.raises(Infeasible, match=r"shrink to 74\.5%"):
+        script.certified("bap_gepoc", altered(plant, initial_bound=box))
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,10 @@
 """Offline synthesis of a robust control invariant ellipsoid with its gain, by semidefinite programming.
 
-`synthesize` looks for the largest certified set: the design problem is scaled, an initial design is found for fixed
-multipliers or from a gain of largest margin, alternation between the linear matrix inequalities and the multipliers
-enlarges the set, and the result is verified exactly. `certify` proves a given set and gain, and `requirements` says
-which contracts leave a plant certifiable. Importing this package imports the solver.
+`certification` reads as one page: gains and what they bear (`tolerance`), at which the largest ellipsoid begins
+(`ellipsoid_certificates`: alternation between linear matrix inequalities and multipliers), else a polytope alone
+(`polytope_certificates`); each is verified exactly, and where there is none `diagnosis` says why. `design_problem` is
+the plant in scaled coordinates. `certify` proves a given set and gain, and `requirements` says which contracts leave a
+plant certifiable. Importing this package imports the solver.
 """
 
 from shields.synthesis.certification import synthesize

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
-from shields.synthesis.initial_designs import (
-    VOLUME_TOLERANCE,
-    ProgressCallback,
-    initial_design,
-    multiplier_triple,
-)
 from shields.synthesis.invariant_set_program import InvariantSetProgram, max_slack_gain
 from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
+from shields.synthesis.tolerance import SUFFICIENT_MARGIN, invariant_ellipsoid
 
 # Some plants still gain 1 % of volume per alternation after ten of them.
 ALTERNATIONS = 40
@@ -22,12 +18,20 @@ ALTERNATIONS = 40
 _SMALLEST_GAIN = 0.02
 # Relative steps of the pattern search over the multipliers.
 _STEPS = (0.3, 0.1, 0.033)
+# The invariant set of a gain is enlarged by at most this factor before X is linearized there.
+_LARGEST_ENLARGEMENT = 100.0
+# A design whose log det is within this of the box ellipsoid's cannot be improved noticeably.
+_VOLUME_TOLERANCE = 2e-4
+
+# Called with the stage that the search is in, and the design of the largest set so far.
+ProgressCallback = Callable[[str, CandidateDesign], None]
 
 
 def largest_set(
     problem: DesignProblem,
     slack: float,
     report: ProgressCallback,
+    gains: Sequence[np.ndarray],
     start: CandidateDesign | None = None,
     alternations: int = ALTERNATIONS,
 ) -> CandidateDesign | None:
@@ -36,18 +40,20 @@ def largest_set(
     Args:
         problem: The scaled design problem.
         slack: Relative tightening of the conditions.
-        report: Called with the stage and the best design so far, per initial design and per alternation.
+        report: Called with the stage and the best design so far, at the initial design and per alternation.
+        gains: Gains in physical units, shape (m, n), of which one has the initial design.
         start: Design of a similar problem, which alternation begins near if it can; None for none.
         alternations: Largest number of them.
     """
     program = InvariantSetProgram(problem, slack)
     best = None if start is None else program.solve(start.multipliers, start.inputs, start.L)
-    best = best or initial_design(problem, program, report)
+    best = best or initial_design(problem, program, gains)
     if best is None:
         return None
+    report("initial design", best)
     steps = list(_STEPS)
     for turn in range(alternations):
-        if -best.log_det < VOLUME_TOLERANCE or not steps:
+        if -best.log_det < _VOLUME_TOLERANCE or not steps:
             break
         better = _alternate(problem, program, best, steps[0])
         report(f"alternation {turn + 1} of at most {alternations}", better)
@@ -55,6 +61,27 @@ def largest_set(
             steps.pop(0)
         best = better
     return best
+
+
+def initial_design(
+    problem: DesignProblem, program: InvariantSetProgram, gains: Sequence[np.ndarray]
+) -> CandidateDesign | None:
+    """Returns a feasible design near the gain whose invariant ellipsoid bears most; None if none bears the radii.
+
+    The program thickens error sets by age and may be infeasible for that reason alone; the gain's own set is not. It is
+    then enlarged so that (I) and the limits have equal slack.
+    """
+    ellipsoids = [invariant_ellipsoid(problem, K) for K in gains]
+    best = max(filter(None, ellipsoids), key=lambda each: each.margin, default=None)
+    if best is None or best.margin < SUFFICIENT_MARGIN:
+        return None
+    Sigma = problem.covering_error_shape[None]
+    L = min(best.margin**2, _LARGEST_ENLARGEMENT) * best.L
+    design = program.solve(best.multipliers, best_input_multipliers(Sigma, L, best.K), L)
+    if design is None and len(problem.error_shapes) > 1:
+        L = best.margin * best.L
+        design = CandidateDesign(L, best.K, best.multipliers, best_input_multipliers(Sigma, L, best.K))
+    return design
 
 
 def _alternate(
@@ -71,15 +98,11 @@ def _alternate(
     lx, le, _ = best.multipliers
     error_fraction = le / (1.0 - lx)
     for factor, shift in ((1.0 + step, 0.0), (1.0 / (1.0 + step), 0.0), (1.0, step), (1.0, -step)):
-        shifted_lx = 1.0 - np.clip((1.0 - lx) * factor, 1e-4, 0.99)
-        shifted_fraction = np.clip(error_fraction * (1.0 + shift), 1e-3, 0.99)
-        best = _larger(best, program.solve(multiplier_triple(shifted_lx, shifted_fraction), best.inputs, best.L))
+        shifted_lx = float(1.0 - np.clip((1.0 - lx) * factor, 1e-4, 0.99))
+        shifted_fraction = float(np.clip(error_fraction * (1.0 + shift), 1e-3, 0.99))
+        shifted = shifted_lx, (1.0 - shifted_lx) * shifted_fraction, (1.0 - shifted_lx) * (1.0 - shifted_fraction)
+        best = _larger(best, program.solve(shifted, best.inputs, best.L))
     return best
-
-
-def tightened(problem: DesignProblem, design: CandidateDesign, slack: float) -> CandidateDesign | None:
-    """Returns the largest set next to a design, with its multipliers, for a larger slack; None if there is none."""
-    return InvariantSetProgram(problem, slack).solve(design.multipliers, design.inputs, design.L)
 
 
 def with_best_gain(problem: DesignProblem, design: CandidateDesign) -> CandidateDesign:

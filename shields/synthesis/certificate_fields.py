@@ -25,18 +25,17 @@ DIGITS, _SHOWN_DIGITS = 12, 6
 
 
 def certificate_of(
-    plant: LinearPlant, problem: DesignProblem, design: CandidateDesign, errors: ErrorSet, slack: float
+    plant: LinearPlant, problem: DesignProblem, design: CandidateDesign, errors: ErrorSet
 ) -> Certificate:
     """Returns the certificate of a design, not yet verified."""
     L, K = problem.to_physical(design.L, design.K)
     L, K = shape_in_digits(L), gain_in_digits(K, plant)
-    volume = float(np.exp(0.5 * design.log_det)) * _share_of_ellipsoid(plant, problem)
     return Certificate(
         L=L,
         K=K,
         proofs=proofs_of(errors, problem, design),
         **fields_of_problem(plant, problem, errors),
-        provenance=provenance_of(plant, L, volume) | {"slack": slack},
+        provenance=provenance_of(plant, L),
     )
 
 
@@ -80,27 +79,15 @@ def fields_of_problem(plant: LinearPlant, problem: DesignProblem, errors: ErrorS
     }
 
 
-def provenance_of(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, Any]:
-    """Returns how a certificate was made, and `_description` of its ellipsoid."""
+def provenance_of(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
+    """Returns how a certificate was made, and what its reader wants to know of its ellipsoid, (n, n), and its plant."""
     solver = f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}"
-    return {"source": "docs/shield_proof.md", "solver": solver} | _description(plant, L, volume)
-
-
-def _description(plant: LinearPlant, L: np.ndarray, volume: float) -> dict[str, Any]:
-    """Returns what a reader of the certificate wants to know about its set and its plant.
-
-    Args:
-        plant: The plant.
-        L: Shape of the set, (n, n).
-        volume: Volume of the set in units of the largest ellipsoid in the safe box.
-    """
-    share = share_of_box(plant, L)
+    known: dict[str, Any] = {"source": "docs/shield_proof.md", "solver": solver}
+    volume, share = _volume_of(plant, L), share_of_box(plant, L)
     sizes = ({} if math.isnan(volume) else {"volume_of_box_ellipsoid": volume}) | share
-    description: dict[str, Any] = {name: float(exact.rounded(size, _SHOWN_DIGITS)) for name, size in sizes.items()}
-    description |= {} if share else reach_recorded(Ellipsoid(L), plant)
-    if plant.assumptions:
-        description["assumptions"] = list(plant.assumptions)
-    return description
+    known |= {name: float(exact.rounded(size, _SHOWN_DIGITS)) for name, size in sizes.items()}
+    known |= {} if share else reach_recorded(Ellipsoid(L), plant)
+    return known | ({"assumptions": list(plant.assumptions)} if plant.assumptions else {})
 
 
 def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, float]:
@@ -135,7 +122,7 @@ def reach_recorded(safe_set: Ellipsoid | Polytope, plant: LinearPlant) -> dict[s
     return {}
 
 
-def volume_of(plant: LinearPlant, L: np.ndarray) -> float:
+def _volume_of(plant: LinearPlant, L: np.ndarray) -> float:
     """Returns the volume of an ellipsoid in units of the largest one in the safe box; NaN where that is not known.
 
     It is where the box has a center, a point in the middle between all of its pairs of ends.
@@ -150,14 +137,6 @@ def volume_of(plant: LinearPlant, L: np.ndarray) -> float:
     units = np.outer(widths, widths)
     own = largest_box_ellipsoid(plant.box * widths / half[:, None])
     return float(np.linalg.det(np.linalg.solve(own, L / units)) ** 0.5)
-
-
-def _share_of_ellipsoid(plant: LinearPlant, problem: DesignProblem) -> float:
-    """Returns the volume of the largest ellipsoid in the box that a set was sought in; that of the plant's box is 1."""
-    if plant.grid_rows is None:
-        return 1.0
-    own = np.linalg.cholesky(largest_box_ellipsoid(plant.box_rows))
-    return float(np.exp(np.log(np.diag(problem.transform)).sum() - np.log(np.diag(own)).sum()))
 
 
 def gain_in_digits(K: np.ndarray, plant: LinearPlant) -> np.ndarray:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ncs_gym import LinearPlant
+from ncs_gym import LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.validation import as_number, as_vector, shown
 from shields.certificate import Certificate
@@ -13,7 +15,7 @@ from shields.errors import Infeasible
 from shields.synthesis.alternating_optimization import ALTERNATIONS
 from shields.synthesis.design_problem import Rest
 from shields.synthesis.diagnosis import infeasibility, with_age_that_helps
-from shields.synthesis.ellipsoid_certificates import certify, largest_ellipsoid, with_tolerated_scale
+from shields.synthesis.ellipsoid_certificates import certify, largest_ellipsoid
 from shields.synthesis.polytope_certificates import (
     around_resting_point,
     certify_polytope,
@@ -22,7 +24,7 @@ from shields.synthesis.polytope_certificates import (
 )
 from shields.synthesis.resting_point import at_operating_point, needs_resting_point, resting_at
 from shields.synthesis.search import Progress, Search
-from shields.synthesis.tolerance import most_tolerated
+from shields.synthesis.tolerance import most_tolerated, tolerated_gains
 from shields.verification import verify
 
 # Alternations of a search that begins near the design of a similar problem.
@@ -117,25 +119,26 @@ def _found(
     Raises:
         TimeoutError, KeyboardInterrupt: Where the search is ended; it holds what was reached.
     """
+    is_centered = rest is None and not needs_resting_point(plant)
+    fixed, failure = at_operating_point(plant) if is_centered else rest, None
     try:
-        if rest is not None or needs_resting_point(plant):
-            alone = around_resting_point(plant, contract, search, rest)
-            return alone.certificate or infeasibility(plant, alone.tolerated, polytope=True, reason=alone.reason)
-        ellipsoid = largest_ellipsoid(plant, contract, search, start, alternations)
-        found, known = ellipsoid.certificate, [] if ellipsoid.K is None else [ellipsoid.K]
-        tolerated, reason = None, ""
-        if found is None:
+        search("gains, and what they bear")
+        gains = tolerated_gains(plant, contract, fixed)
+        found = None
+        if is_centered:
+            try:
+                found = largest_ellipsoid(plant, contract, [each.K for each in gains], search, start, alternations)
+            except Infeasible as none:
+                failure = none
+        if found is None and polytope:
             search.candidate = None
-            if polytope:
-                alone = around_resting_point(plant, contract, search, at_operating_point(plant), known)
-                found, tolerated, reason = alone
-            elif ellipsoid.failure is None:
-                tolerated = most_tolerated(plant, contract, polytope=False)
-        if found is not None:
-            return with_tolerated_scale(found, plant, ellipsoid.problem)
-        return ellipsoid.failure or infeasibility(plant, tolerated, polytope=polytope, reason=reason)
+            found = around_resting_point(plant, contract, gains, search, fixed)
+        if found is None:
+            return failure or infeasibility(plant, most_tolerated(plant, contract, polytope=False), polytope=False)
     except Infeasible as none:
-        return none
+        return failure or none
+    scale = max([1.0, *(each.margin for each in gains)])  # it is 1 at least, because this certificate exists
+    return replace(found, provenance=found.provenance | {"tolerated_scale": float(exact.rounded(scale, 3))})
 
 
 def carried_over(certificate: Certificate, plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -102,7 +102,7 @@ class DesignProblem:
         longest = np.linalg.eigvalsh(np.stack(kept))[:, -1]
         return np.stack(kept) + _SMALLEST_AXIS_RATIO**2 * longest[:, None, None] * np.eye(self.n)
 
-    @property
+    @cached_property
     def covering_error_shape(self) -> np.ndarray:
         """The shape of an ellipsoid that contains every error set, (n, n)."""
         return reduce(joined, self.error_shapes)
@@ -127,14 +127,17 @@ class CandidateDesign:
         K: Gain, shape (m, n).
         multipliers: Multipliers (lx, le, ld) of (I).
         inputs: Multipliers mu_i of (U), shape (m,).
-        log_det: Logarithm of det L; 0 is the largest ellipsoid in the safe box.
     """
 
     L: np.ndarray
     K: np.ndarray
     multipliers: tuple[float, float, float]
     inputs: np.ndarray
-    log_det: float
+
+    @cached_property
+    def log_det(self) -> float:
+        """Logarithm of det L; 0 is the largest ellipsoid in the safe box."""
+        return float(np.linalg.slogdet(self.L)[1])
 
 
 def design_problem(

@@ -14,9 +14,8 @@ from ncs_gym.estimation.error_sets import ErrorSetError
 from ncs_gym.plants.description import row_limit
 from ncs_gym.plants.hard_bounds import FREE_REACH
 from shields.errors import Infeasible
-from shields.synthesis.initial_designs import SUFFICIENT_MARGIN
 from shields.synthesis.search import Progress
-from shields.synthesis.tolerance import Tolerated, most_tolerated
+from shields.synthesis.tolerance import SUFFICIENT_MARGIN, Tolerated, most_tolerated
 
 # Digits of the share of the radii that is named.
 _SHOWN_DIGITS = 3

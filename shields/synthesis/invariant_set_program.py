@@ -91,10 +91,9 @@ class InvariantSetProgram:
             return None
         L, F = value_of(self._L), self._unit[:, None] * value_of(self._F)
         L = 0.5 * (L + L.T)
-        sign, log_det = np.linalg.slogdet(L)
-        if sign <= 0 or np.linalg.eigvalsh(L)[0] <= 0.0:
+        if np.linalg.eigvalsh(L)[0] <= 0.0:
             return None
-        return CandidateDesign(L, np.linalg.solve(L, F.T).T, multipliers, inputs, float(log_det))
+        return CandidateDesign(L, np.linalg.solve(L, F.T).T, multipliers, inputs)
 
 
 def max_slack_gain(problem: DesignProblem, design: CandidateDesign) -> np.ndarray:

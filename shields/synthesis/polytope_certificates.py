@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,9 @@ from shields.synthesis.certificate_fields import (
     provenance_of,
     reach_recorded,
     shape_in_digits,
-    volume_of,
 )
 from shields.synthesis.design_problem import Rest, design_problem
+from shields.synthesis.diagnosis import infeasibility
 from shields.synthesis.ellipsoid_certificates import MORE_DIGITS
 from shields.synthesis.invariant_polytope import (
     Feedback,
@@ -41,7 +41,7 @@ from shields.synthesis.resting_point import (
 )
 from shields.synthesis.search import Progress
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
-from shields.synthesis.tolerance import Tolerated, tolerated_gains
+from shields.synthesis.tolerance import Tolerated, most_tolerant
 from shields.verification import verify
 
 # The largest ellipsoid in a polytope is shrunk to this in its faces, more than its digits are rounded by.
@@ -52,20 +52,6 @@ _POINTS_OF_REST_LOG2 = 12
 _MOST_SOUGHT = 4
 # What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
 _NOT_CERTIFIED = (Infeasible, ArithmeticError, ValueError, CertificateError)
-
-
-class FoundPolytope(NamedTuple):
-    """What a search for a polytope alone found.
-
-    Attributes:
-        certificate: The verified certificate; None if there is none.
-        tolerated: What the most tolerant gain bears; None where no gain is found.
-        reason: Why the polytope of the first gain was given up.
-    """
-
-    certificate: Certificate | None
-    tolerated: Tolerated | None
-    reason: str
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
@@ -153,8 +139,7 @@ def _certified_polytope(
             inside = np.concatenate([inside, limits.box_rows])
         L = largest_box_ellipsoid(inside)
         L = shape_in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
-        provenance = provenance_of(plant, L, volume_of(plant, L))
-        return Certificate(L=L, polytope=polytope, provenance=provenance, **others)
+        return Certificate(L=L, polytope=polytope, provenance=provenance_of(plant, L), **others)
 
     return _first_verified(map(certificate, invariant_polytopes(feedback, plant, progress)), plant, progress)
 
@@ -181,35 +166,32 @@ def _first_verified(candidates: Iterable[Certificate], plant: LinearPlant, progr
 def around_resting_point(
     plant: LinearPlant,
     contract: ChannelContract | None,
+    gains: Sequence[Tolerated],
     progress: Progress,
     fixed: Rest | None = None,
-    known: Sequence[np.ndarray] = (),
-) -> FoundPolytope:
-    """Returns a verified certificate of a polytope alone, around a resting point, or what the best gain bears.
+) -> Certificate:
+    """Returns a verified certificate of a polytope alone, around a resting point.
 
     One polytope is sought for each of the `_MOST_SOUGHT` first gains, and for the most tolerant one.
 
     Args:
         plant: The plant.
         contract: Channel contract; None for none.
+        gains: Gains that are tried if they bear the radii.
         progress: Called with a line of text now and then.
         fixed: The resting point; the one that suits each gain by default.
-        known: Gains, shape (m, n), that are tried as well.
 
     Raises:
-        Infeasible: If the plant has no error set, or no resting point.
+        Infeasible: If there is none: why the polytope of the first gain was given up.
     """
-    progress("resting point and the gain that tolerates most")
-    gains = tolerated_gains(plant, contract, fixed, known)
-    best = max(gains, key=lambda each: each.margin, default=None)
     tried = _by_share([each for each in gains if each.margin >= 1.0], plant, contract, progress, fixed)
-    reasons: list[str] = []
+    best, reasons = most_tolerant(gains), list[str]()
     for each in [*tried[:_MOST_SOUGHT], *(each for each in tried[_MOST_SOUGHT:] if each is best)]:
         try:
-            return FoundPolytope(_certified_polytope(plant, each.K, contract, progress, each.rest), best, "")
+            return _certified_polytope(plant, each.K, contract, progress, each.rest)
         except _NOT_CERTIFIED as failure:
             reasons.append(_reason_of(failure))
-    return FoundPolytope(None, best, reasons[0] if reasons else "no gain was found")
+    raise infeasibility(plant, best, polytope=True, reason=reasons[0] if reasons else "")
 
 
 def _by_share(

@@ -1,4 +1,4 @@
-"""What radii of disturbances and errors a gain bears, and which gain bears most."""
+"""What radii of disturbances and errors a gain bears, with a polytope or an ellipsoid, and which gain bears most."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 from scipy.optimize import minimize
 
 from ncs_gym import ChannelContract, LinearPlant, exact
 from ncs_gym.plants.lqr import lqr_gain
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import DesignProblem, Rest, design_problem
-from shields.synthesis.max_margin_gain import MaxMarginGain, max_margin_gain
 from shields.synthesis.resting_point import (
     around,
     at_operating_point,
@@ -42,6 +42,10 @@ _DIGITS = 9
 _FASTER = 0.95
 # What a gain that is too slow is said to lack of every limit.
 _TOO_SLOW = -1e3
+# Exact verification needs a margin a little above 1.
+SUFFICIENT_MARGIN = 1.0 + 1e-5
+# Multipliers of an ellipsoid are sought by so many evaluations; their logits are at most so large.
+_EVALUATIONS, _LARGEST_LOGIT = 100, 12.0
 
 
 def regulators(plant: LinearPlant, decay: float = 1.0) -> list[np.ndarray]:
@@ -232,20 +236,58 @@ def _support(rows: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return best, slopes
 
 
+class InvariantEllipsoid(NamedTuple):
+    """The smallest ellipsoid that is invariant under a gain, in scaled coordinates.
+
+    Attributes:
+        K: The gain, shape (m, n).
+        L: Shape of the set, (n, n); it respects the limits if `margin` >= 1.
+        multipliers: Multipliers (lx, le, ld) with which (I) holds.
+        margin: Factor by which all radii may grow before it breaks a limit.
+    """
+
+    K: np.ndarray
+    L: np.ndarray
+    multipliers: tuple[float, float, float]
+    margin: float
+
+
+def invariant_ellipsoid(problem: DesignProblem, K: np.ndarray) -> InvariantEllipsoid | None:
+    """Returns the invariant ellipsoid of the gain K, shape (m, n), that bears the most; None if K does not stabilize.
+
+    For given multipliers (I) has a smallest solution, a Lyapunov series, which grows with the squares of the radii.
+    """
+    _, K = problem.to_scaled(np.eye(problem.n), K)
+    BK, Sigma = problem.B @ K, problem.covering_error_shape
+    closed_loop, from_errors = problem.A + BK, BK @ Sigma @ BK.T
+    at_once = np.sqrt(np.maximum(((K @ Sigma) * K).sum(axis=1), 0.0))
+    slowest = float(np.abs(np.linalg.eigvals(closed_loop)).max()) ** 2
+    if not slowest < 1.0:
+        return None
+
+    def at(logits: np.ndarray) -> InvariantEllipsoid:
+        above, fraction = 1.0 / (1.0 + np.exp(-np.clip(logits, -_LARGEST_LOGIT, _LARGEST_LOGIT)))
+        lx = float(slowest + (1.0 - slowest) * above)
+        le, ld = float((1.0 - lx) * fraction), float((1.0 - lx) * (1.0 - fraction))
+        L = solve_discrete_lyapunov(closed_loop / np.sqrt(lx), from_errors / le + problem.D_u / ld)
+        by_state = [np.sqrt(np.maximum(((rows @ L) * rows).sum(axis=1), 0.0)) for rows in (problem.C, K)]
+        used = float(np.concatenate([by_state[0], by_state[1] + at_once]).max())
+        return InvariantEllipsoid(K, 0.5 * (L + L.T), (lx, le, ld), 1.0 / used if used > 0.0 else 0.0)
+
+    options = {"maxfev": _EVALUATIONS, "xatol": 1e-3, "fatol": 1e-6}
+    best = minimize(lambda logits: -at(logits).margin, np.array([-1.0, 0.0]), method="Nelder-Mead", options=options)
+    return at(np.round(best.x, _DIGITS))
+
+
 def tolerated_gains(
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    fixed: Rest | None = None,
-    known: Sequence[np.ndarray] = (),
-    enough: float = np.inf,
+    plant: LinearPlant, contract: ChannelContract | None, fixed: Rest | None = None, enough: float = np.inf
 ) -> list[Tolerated]:
-    """Returns gains with what they bear: given ones, the most tolerant one, regulators.
+    """Returns gains with what they bear: the most tolerant one, and regulators.
 
     Args:
         plant: The plant.
         contract: Channel contract; None for none.
         fixed: The resting point; the one that suits each gain by default.
-        known: Gains, shape (m, n).
         enough: No more tolerant one is sought where one bears so much.
 
     Raises:
@@ -254,13 +296,17 @@ def tolerated_gains(
     rest = fixed or farthest_from_limits(plant)
     _, errors = design_problem(plant, contract, limits_around(plant, rest))
     tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest), fixed)
-    first = [found for K in known if (found := tolerance.of(K))]
     pairs = zip(regulators(plant), regulators(plant, _FASTER), strict=False)
-    others = [found for K, faster in pairs if (found := tolerance.of(K) or tolerance.of(faster))]
-    best = max([*first, *others], key=lambda each: each.margin, default=None)
+    gains = [found for K, faster in pairs if (found := tolerance.of(K) or tolerance.of(faster))]
+    best = most_tolerant(gains)
     if best is None or best.margin >= enough:
-        return [*first, *others]
-    return [*first, *filter(None, [tolerance.improved(best.K, enough)]), *others]
+        return gains
+    return [*filter(None, [tolerance.improved(best.K, enough)]), *gains]
+
+
+def most_tolerant(gains: Sequence[Tolerated]) -> Tolerated | None:
+    """Returns the gain that bears most; None of none."""
+    return max(gains, key=lambda each: each.margin, default=None)
 
 
 def most_tolerated(
@@ -278,22 +324,10 @@ def most_tolerated(
         Infeasible: If there is no error set, or no equilibrium within the limits.
     """
     fixed = None if needs_resting_point(plant) else at_operating_point(plant)
-    if polytope:
-        return max(tolerated_gains(plant, contract, fixed, (), enough), key=lambda each: each.margin, default=None)
-    problem, _ = design_problem(plant, contract)
-    gain = max_margin_gain(problem, problem.covering_error_shape)
-    return None if gain is None else of_ellipsoid(plant, problem, gain)
-
-
-def of_ellipsoid(plant: LinearPlant, problem: DesignProblem, gain: MaxMarginGain) -> Tolerated:
-    """Returns what a gain bears with an ellipsoid around the operating point.
-
-    Where the box counts between samples, which the search for the gain knows nothing of, a bound from above: at most
-    what the gain bears with a polytope, as far as that is known.
-    """
-    K, rest = problem.to_physical(gain.L, gain.K)[1], at_operating_point(plant)
-    T, errors = problem.transform, problem.error_shapes
-    found = Tolerance(plant, T @ errors @ T.T, plant.disturbance.shape_matrix, rest).of(K)
-    if found is None:
-        return Tolerated(K, rest, gain.margin)
-    return found._replace(margin=gain.margin if plant.grid_rows is None else min(gain.margin, found.margin))
+    gains = tolerated_gains(plant, contract, fixed, enough if polytope else np.inf)
+    if not polytope:
+        problem, _ = design_problem(plant, contract)
+        pairs = [(each, invariant_ellipsoid(problem, each.K)) for each in gains]
+        # Between samples an ellipsoid bears no more than a polytope.
+        gains = [each._replace(margin=min(each.margin, found.margin)) for each, found in pairs if found is not None]
+    return most_tolerant(gains)
