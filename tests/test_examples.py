@@ -163,7 +163,7 @@ def test_versions_of_foreign_packages_are_those_that_the_page_names():
         assert all(version in row for version in packages.values() if version)
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", sorted(RUNS.keys() - TRAINING - LONG - FOREIGN.keys()))
 def test_example_prints_what_it_is_about(name):
     assert_expected(name, output_of_file(ROOT / "examples" / name, *RUNS[name][0]))

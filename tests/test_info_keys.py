@@ -93,7 +93,7 @@ def test_page_names_every_key_once():
     assert sorted(named) == sorted(kinds("lookahead"))
 
 
-@pytest.mark.cases(5)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("mode", [None, "project", "monitor", "lookahead"])
 def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
     env_id, certificate = loop
@@ -216,7 +216,7 @@ VECTORS = ["NextStep", "SameStep"]
 FEW = {"num_envs": 3, "max_episode_steps": 5}
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("env_id", registered_ids())
 def test_nobody_changes_an_environment_by_writing_into_what_it_told(env_id):
     assert_tells_what_is_the_listeners_own(lambda: gym.make(env_id))

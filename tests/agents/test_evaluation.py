@@ -52,13 +52,6 @@ def test_steps_of_its_trajectory_that_cost_are_told():
     assert path.violated.sum() == played.episodes[0].violation_steps > 5
 
 
-def test_it_is_printed_as_one_line():
-    played = evaluate(CRUISE, zero, 3, 1)
-    mean = np.mean([episode.episode_return for episode in played.episodes])
-    text = f"<Evaluation: 3 episodes of 600 steps in all, 0 with a violation, mean return {mean:.4g}>"
-    assert str(played) == repr(played) == text
-
-
 def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
     make_vec, seeds = gym.make_vec, []
 

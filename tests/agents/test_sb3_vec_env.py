@@ -295,6 +295,7 @@ class Laps(gym.Env):
         return scale
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("nested", [True, False])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_infos_are_those_that_each_environment_reported(mode, nested):

@@ -26,21 +26,6 @@ MODEL, ABOUT = Model(A, B, None, dt=0.1), Model(A, B, None, dt=0.1, at=([1.0, 2.
 LIMITS, BOUNDS = Limits(state=[1.0, 2.0], input=1.0), Bounds([0.01, 0.02], 0.01, 0.02)
 
 
-def around_a_point():
-    rows = [([1.0, 1.0], None, 0.0, 4.0), ([1.0, 0.0], [1.0], 0.0, 3.0)]
-    return LinearPlant(ABOUT, Limits(([0.0, 1.0], [2.5, np.inf]), (0.0, 2.0), rows), BOUNDS)
-
-
-def test_limits_around_a_point_are_absolute_and_keep_both_ends():
-    plant = around_a_point()
-    np.testing.assert_allclose(plant.own_limits, [[-1.0, -1.0], [1.5, np.inf]])
-    np.testing.assert_array_equal(plant.input_ends, [[-0.5], [1.5]])
-    np.testing.assert_allclose(plant.box[2] @ np.ones(2) / plant.box_ends[:, 2], 2.0 / np.array([-3.0, 1.0]))
-    np.testing.assert_allclose(
-        plant.mixed_rows[0] @ [1.0, 0.0, 1.0] / plant.mixed_ends[:, 0], 2.0 / np.array([-1.5, 1.5])
-    )
-
-
 def test_constants_of_a_model_are_at_rest_at_its_point():
     x, u = np.array([1.0, 2.0]), np.array([0.5])
     c = x - A @ x - B @ u

@@ -183,7 +183,7 @@ def first_errors(plant: LinearPlant) -> np.ndarray:
     return errors
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("bound", "use"),
     [

@@ -21,7 +21,7 @@ def numbers(axis):
     return [text.get_text() for text in axis.texts]
 
 
-@pytest.mark.parametrize("count", [1, 2, 4, 5, 11])
+@pytest.mark.parametrize("count", [1, 5])
 def test_every_arm_has_a_panel_and_every_channel_a_field(count):
     arms = [f"arm {i}" for i in range(count)]
     figure = sweep_map(cells(arms), arms)

@@ -125,7 +125,7 @@ def test_training_in_which_nothing_happened_has_no_figure(plant):
     assert [*comparison_figures(plant, summary_of(shown), shown, EPISODE)] == ["scatter", "episode"]
 
 
-@pytest.mark.parametrize(("n", "m"), [(2, 1), (4, 1), (4, 2)])
+@pytest.mark.parametrize(("n", "m"), [(2, 1), (4, 2)])
 def test_time_series_have_a_panel_for_states_inputs_and_events(n, m):
     plant = random_plant(1, n, m)
     path = trajectory(np.zeros((11, n)), m, intervened=(2, 3), arrivals=(0, 4, 5))

@@ -189,6 +189,7 @@ def test_entries_are_what_infos_say_and_actions_are_those_decided():
         over = any(ends)
 
 
+@pytest.mark.cases(6)
 @pytest.mark.parametrize(
     ("actions", "size"),
     [
@@ -363,7 +364,7 @@ class Echo(gym.Env):
         return np.array(action, np.float32), 0.0, False, False, {}
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("late", ["apply", "queue"])
 @pytest.mark.parametrize(
     "downlink",

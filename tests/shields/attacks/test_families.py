@@ -78,6 +78,7 @@ def certified(name, plant=None):
     return certificate_of(plant or make(), settings.get("contract"), safe_set)
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize(("count", "steps"), SIZES)
 @pytest.mark.parametrize("mode", ["project", "boundary", "lookahead"])
 @pytest.mark.parametrize("name", FAMILIES)
@@ -195,7 +196,7 @@ def varying_tank():
     return family_of(tank, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
 
 
-@pytest.mark.cases(6)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("every", [1, 10])
 @pytest.mark.parametrize("outward", [-1.0, 1.0])
 @pytest.mark.parametrize("k", [0.19, 0.2, 0.21])

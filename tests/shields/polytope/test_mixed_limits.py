@@ -90,6 +90,7 @@ def test_unshielded_steps_beyond_a_limit_are_counted(name):
     assert counted > 5
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", MIXED)
 def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name):
     plant, found = PLANTS[name], certificate(name)
@@ -132,6 +133,7 @@ def test_episode_begins_with_the_operating_input_as_the_one_before():
         assert info["state"][:2].all()
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 def test_limit_of_rates_is_kept_behind_a_downlink(mode):
     plant = PLANTS["rates"]

@@ -143,6 +143,7 @@ def mutants(name):
     yield "center", replace(found, resting_state=shifted, polytope=replace(P, center=shifted))
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", ASYMMETRIC)
 def test_changed_certificate_is_refused_by_both_engines(name):
     plant, count, refused = PLANTS[name], 0, 0

@@ -73,6 +73,7 @@ class World:
         return guaranteed
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("length", [1, 2, 5, 10, 30])
 @pytest.mark.parametrize("downlink", [None, DOWNLINK])
 def test_outage_of_the_plant_ends_the_proof_for_the_episode(length, downlink):
@@ -167,6 +168,7 @@ def far_out(plant, seed):
     return 0.5 * certificate_of(plant, ChannelContract(4)).safe_set.sample_boundary(np.random.default_rng(seed))
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("downlink", [None, DOWNLINK])
 @pytest.mark.parametrize("seed", range(5))
 def test_controller_that_starts_in_the_middle_claims_nothing_until_samples_tell_where_the_state_is(downlink, seed):
@@ -252,6 +254,7 @@ def test_too_few_or_too_coarse_samples_are_no_first_estimate():
     assert first_estimate(local, ages, {0: np.zeros(4)}, [], local.sensor_error.shape_matrix) is None
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("loss", [0.0, 0.5])
 @pytest.mark.parametrize("delay", [0, 1, 4])
 def test_state_that_many_samples_tell_is_found_on_a_channel_of_any_delay(delay, loss):
@@ -279,6 +282,7 @@ def test_state_that_many_samples_tell_is_found_on_a_channel_of_any_delay(delay, 
 
 
 # With a known first estimate a sample of step 0 is of no use.
+@pytest.mark.cases(6)
 @pytest.mark.parametrize(("known", "first"), [(True, 1), (True, 2), (False, 0), (False, 2)])
 @pytest.mark.parametrize("apart", [0, 1, 3])
 def test_two_values_of_one_sample_end_the_guarantee_whether_the_start_is_known_or_not(known, apart, first):
