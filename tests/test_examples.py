@@ -125,7 +125,8 @@ TRAINING = {
     "your_gym_env.py",
 }
 # They synthesize certificates, or simulate an hour: in processes of their own, of `make test-slow`, alone.
-LONG = {"both_directions.py", "lost_hour.py", "mpc_loop.py", "quadruple_tank.py", "unstable_plant_loop.py"}
+LONG = {"both_directions.py", "lost_hour.py", "mpc_loop.py", "quadruple_tank.py", "servo_requirements.py"}
+LONG |= {"unstable_plant_loop.py"}
 # Packages that no extra installs, and the versions that the examples were tried with (docs/agents.md).
 FOREIGN = {
     "minari_dataset.py": {"minari": "0.5.4", "jax": None, "h5py": None},

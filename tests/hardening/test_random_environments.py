@@ -75,13 +75,13 @@ def run_vector(settings, seed, steps, mode):
 
 
 @given(settings=environment_settings(), seed=st.integers(0, 1000))
-@examples(12)
+@examples(8)
 def test_random_environments_run(settings, seed):
     run_scalar(settings, seed, 25)
 
 
 @given(settings=environment_settings(), seed=st.integers(0, 1000), mode=st.sampled_from(["NextStep", "SameStep"]))
-@examples(8)
+@examples(5)
 def test_random_vector_environments_run(settings, seed, mode):
     run_vector(settings, seed, 16, mode)
 

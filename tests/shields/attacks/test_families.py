@@ -102,6 +102,7 @@ def test_certificate_of_the_middle_alone_does_not_hold_and_that_is_seen(name):
     assert name != "truck" or counts["unsafe"] > 100
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", FAMILIES)
 def test_both_verifiers_agree_and_refuse_the_certificate_of_the_middle(name):
     family = FAMILIES[name][0]()

@@ -359,7 +359,7 @@ def test_a_solver_that_fails_means_a_certified_plan_or_the_stored_one(how, monke
     assert sum(one.reason == "planned" for one in working) > sum(one.reason == "planned" for one in failing)
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.filterwarnings("ignore::ncs_gym.UnusedPacketsWarning")
 @pytest.mark.parametrize("how", FAILURES)
 def test_no_failure_of_the_solver_leaves_the_box(how, monkeypatch):

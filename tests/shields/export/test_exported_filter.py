@@ -224,6 +224,7 @@ def test_an_altered_table_never_starts(exported, tmp_path):
     assert Boards(folder, 1, n, 1).start(0, np.zeros((1, n)))
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(("name", "single"), [each for each in FILTERS if each.values[0] in ("CSTR", "BatchReactor")])
 def test_vectors_pass_with_sanitizers_and_a_wrong_one_is_found(exported, name, single, tmp_path):
     folder = copied(exported(name, single)[0], tmp_path)

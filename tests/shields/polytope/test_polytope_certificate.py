@@ -187,6 +187,7 @@ def slow_plant():
     )
 
 
+@pytest.mark.slow
 def test_polytope_of_too_many_rows_is_replaced_by_a_coarser_one_that_is_nearly_as_large(monkeypatch):
     plant, lines = slow_plant(), []
     monkeypatch.setattr(search, "MOST_ROWS", 12)

@@ -192,6 +192,7 @@ def test_controller_that_starts_in_the_middle_claims_nothing_until_samples_tell_
     assert np.abs(PLANT.box_rows @ world.state).max() <= 1.0
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("plant", [PLANT, cart_pole(full_state=False), truck_trailer()])
 def test_first_estimate_holds_what_it_claims_against_the_worst_disturbance_and_noise(plant):
     """The claim is attacked by the extreme disturbances and noises of one direction of the error."""

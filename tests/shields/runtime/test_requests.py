@@ -70,6 +70,7 @@ def test_contract_is_kept_from_the_first_proof_of_an_unknown_start_on(plant, con
     assert len(ages) > 50
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("downlink", [None, DOWNLINK])
 def test_shield_keeps_its_set_whatever_is_asked_for(downlink):
     env = vector_env(40, plant=PLANT, channel=CHANNEL, contract=CONTRACT, downlink=downlink, disturbance="sphere")
