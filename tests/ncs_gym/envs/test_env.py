@@ -8,7 +8,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import ncs_gym
-from ncs_gym import Channel, Ellipsoid, GilbertElliott, Regulation
+from ncs_gym import Channel, Ellipsoid, GilbertElliott
 from tests.plants import random_plant
 
 IDS = ["ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/LinearNCS-v0"]
@@ -119,26 +119,6 @@ def test_full_throttle_under_the_worst_disturbance_stays_in_the_observation_spac
         for _ in range(100):
             *_, info = env.step(np.full(1, sign, np.float32))
             assert (np.abs(info["estimate"]) <= env.observation_space.high[:2]).all()
-
-
-class Clumsy(Regulation):
-    """A task that fails once, in the middle of a step."""
-
-    def reward(self, plant, memory, state, u):
-        if u[0] > 3.9:
-            raise RuntimeError("clumsy")
-        return 0.0
-
-
-def test_a_step_that_failed_half_way_needs_a_reset():
-    env = make(IDS[0], task=Clumsy()).unwrapped
-    env.reset(seed=0)
-    with pytest.raises(RuntimeError, match="clumsy"):
-        env.step(np.ones(1, np.float32))
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(np.zeros(1, np.float32))
-    env.reset()
-    env.step(np.zeros(1, np.float32))
 
 
 def test_a_variant_of_the_truck_keeps_the_case_studys_disturbance_and_starts():

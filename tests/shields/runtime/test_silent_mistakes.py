@@ -36,17 +36,6 @@ def certificate():
     return certificate_of(PLANT)
 
 
-def test_stepping_after_the_end_of_an_episode_is_refused():
-    env = loop_env(PLANT, terminate_on_violation=True)
-    env.reset(options={"state": [1.9, 0.0]})
-    while not env.step([1.0])[2]:
-        pass
-    with pytest.raises(gym.error.ResetNeeded, match="the episode is over"):
-        env.step([1.0])
-    env.reset()
-    env.step([1.0])
-
-
 @pytest.mark.filterwarnings("error")
 def test_proposals_that_are_no_input_are_told_of_once_and_not_applied(certificate):
     gradient = torch.tensor([0.5], requires_grad=True)
