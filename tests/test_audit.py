@@ -31,6 +31,7 @@ def test_make_audit_runs_it():
     assert ".ci/audit.py" in recipe
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     ("prints", "complains", "ends", "code", "words"),
     [

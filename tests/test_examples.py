@@ -125,7 +125,8 @@ TRAINING = {
     "your_gym_env.py",
 }
 # They synthesize certificates, or simulate an hour: in processes of their own, of `make test-slow`, alone.
-LONG = {"both_directions.py", "lost_hour.py", "mpc_loop.py", "quadruple_tank.py", "unstable_plant_loop.py"}
+LONG = {"both_directions.py", "lost_hour.py", "mpc_loop.py", "quadruple_tank.py", "servo_requirements.py"}
+LONG |= {"unstable_plant_loop.py"}
 # Packages that no extra installs, and the versions that the examples were tried with (docs/agents.md).
 FOREIGN = {
     "minari_dataset.py": {"minari": "0.5.4", "jax": None, "h5py": None},
@@ -163,7 +164,7 @@ def test_versions_of_foreign_packages_are_those_that_the_page_names():
         assert all(version in row for version in packages.values() if version)
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", sorted(RUNS.keys() - TRAINING - LONG - FOREIGN.keys()))
 def test_example_prints_what_it_is_about(name):
     assert_expected(name, output_of_file(ROOT / "examples" / name, *RUNS[name][0]))

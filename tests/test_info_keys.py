@@ -93,7 +93,7 @@ def test_page_names_every_key_once():
     assert sorted(named) == sorted(kinds("lookahead"))
 
 
-@pytest.mark.cases(5)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("mode", [None, "project", "monitor", "lookahead"])
 def test_docstrings_have_every_key_of_one_environment_and_of_many(loop, mode):
     env_id, certificate = loop
@@ -216,7 +216,7 @@ VECTORS = ["NextStep", "SameStep"]
 FEW = {"num_envs": 3, "max_episode_steps": 5}
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("env_id", registered_ids())
 def test_nobody_changes_an_environment_by_writing_into_what_it_told(env_id):
     assert_tells_what_is_the_listeners_own(lambda: gym.make(env_id))
@@ -224,6 +224,7 @@ def test_nobody_changes_an_environment_by_writing_into_what_it_told(env_id):
         assert_tells_what_is_the_listeners_own(lambda mode=mode: gym.make_vec(env_id, autoreset_mode=mode, **FEW))
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("mode", ["project", pytest.param("monitor", marks=pytest.mark.slow), "lookahead"])
 def test_nobody_changes_a_shield_by_writing_into_what_it_told(loop, mode):
     env_id, certificate = loop
@@ -247,6 +248,7 @@ CHANNELS = {"vector": LATE, "dict": {"count": LATE, "odd": Channel(loss=0.3)}, "
 NETWORK = {"downlink": Channel(delay=1), "observe": ("age", "arrived", "pending_actions"), "delay_reward": True}
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("kind", CHANNELS)
 @pytest.mark.parametrize("network", [{}, NETWORK])
 def test_nobody_changes_a_network_by_writing_into_what_it_told(kind, network):

@@ -55,6 +55,7 @@ def shielded(certificate):
     return play(safety_shield(gym.make(CRUISE), certificate, penalty=0.5), SOME, 1)
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("order", ["outside", "inside"])
 @pytest.mark.parametrize("name", SCALAR)
 def test_wrappers_change_no_decision_on_either_side_of_the_shield(name, order, shielded, certificate):
@@ -69,6 +70,7 @@ def test_wrappers_change_no_decision_on_either_side_of_the_shield(name, order, s
     assert_same_infos(shielded[2], wrapped[2])
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("order", ["bare", "outside", "inside"])
 @pytest.mark.parametrize("name", VECTOR)
 def test_vector_wrappers_change_neither_seeds_nor_infos_nor_decisions(name, order, certificate):

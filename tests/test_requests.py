@@ -76,23 +76,6 @@ def test_contract_forces_nothing_on_the_best_period_and_everything_on_who_never_
     assert never.forced == never.packets > 0.0
 
 
-def test_returns_are_without_the_price_of_packets():
-    free, paid = (result_of(every(2), cost=cost) for cost in (0.0, 10.0))
-    np.testing.assert_allclose(free.returns, paid.returns, atol=1e-9)
-
-
-def test_acknowledged_policy_waits_for_the_last_request():
-    env = environments()
-    asking = Asking(env, weakly_pushing)
-    policy = with_rule(asking, acknowledged(1))
-    observations, info = env.reset(seed=0)
-    requested = []
-    for _ in range(12):
-        observations, *_, info = env.step(policy(observations, info))
-        requested.append(info["requested"])
-    assert not (np.array(requested[1:]) & np.array(requested[:-1])).any()  # a packet is one step late
-
-
 def test_margin_is_that_of_the_decision_where_the_proposal_passes():
     env = environments()
     asking = Asking(env, weakly_pushing)
@@ -120,11 +103,6 @@ def test_agent_that_only_asks_sees_the_margin_and_leaves_the_inputs_to_the_contr
         assert only.observation_space.contains(observations)
         assert info["input_proposed"] == pytest.approx(0.3 * env.unwrapped.plant.u_max.item())
     assert info["requested"].sum() == info["request_forced"].sum()
-
-
-def test_policies_behind_a_downlink_are_refused():
-    with pytest.raises(ValueError, match="leave out the downlink"):
-        Asking(environments(downlink=Channel(delay=1), contract=ChannelContract(7, 0.002)), weakly_pushing)
 
 
 @pytest.mark.slow

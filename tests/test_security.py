@@ -143,9 +143,7 @@ def agent(tmp_path):
     return tmp_path / "a" / "agent"
 
 
-@pytest.mark.parametrize(
-    "name", ["../evil.pth", "/{root}/evil.pth", "..\\evil.pth", "C:\\evil.pth", "x" * 300, "e.pth", "../data", "x\0y"]
-)
+@pytest.mark.parametrize("name", ["../evil.pth", "/{root}/evil.pth", "..\\evil.pth", "x\0y"])
 def test_members_of_the_weights_of_others_are_not_unpacked(name, agent, tmp_path):
     data = io.BytesIO()
     with zipfile.ZipFile(agent / "model.zip") as source, zipfile.ZipFile(data, "w") as target:

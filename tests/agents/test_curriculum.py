@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import SB3VecEnv
 from agents.loop import CostPenalty
@@ -29,14 +29,6 @@ def shields():
     return vector_shield(gym.make_vec(ID, num_envs=2))
 
 
-def test_channel_of_a_shield_is_not_set_through_stable_baselines3_or_the_adapter():
-    shielded = DummyVecEnv([shield])
-    with pytest.raises(AttributeError):
-        shielded.set_attr("channel", Channel(loss=0.5))
-    with pytest.raises(AttributeError, match="of single environments"):
-        SB3VecEnv(shields()).set_attr("channel", Channel())
-
-
 def test_channel_of_an_option_lasts_one_episode_under_stable_baselines3_alone_and_under_our_adapter():
     def episodes(env):
         env.set_options({"channel": Channel(loss=0.5, delay=4)})
@@ -55,23 +47,6 @@ def test_channel_of_an_option_lasts_one_episode_under_stable_baselines3_alone_an
     for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
         vector = gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, autoreset_mode=mode, **made)
         assert episodes(SB3VecEnv(vector, info_keywords=("channel_loss",))) == theirs
-
-
-@pytest.mark.parametrize("kind", ["SubprocVecEnv", "AsyncVectorEnv"])
-def test_what_is_drawn_from_changes_in_worker_processes_too(kind):
-    makes = [lambda: RandomChannel(gym.make(ID), [Channel(loss=0.1)])] * 2
-    if kind == "AsyncVectorEnv":
-        envs = gym.vector.AsyncVectorEnv(makes)
-        say, losses = envs.call, lambda: envs.reset(seed=0)[1]["channel_loss"].tolist()
-    else:
-        envs = SubprocVecEnv(makes, "fork")
-        say, losses = envs.env_method, lambda: envs.reset() is None or [i["channel_loss"] for i in envs.reset_infos]
-    try:
-        assert losses() == [0.1, 0.1]
-        say("draw_from", [Channel(loss=0.5)])
-        assert losses() == [0.5, 0.5]
-    finally:
-        envs.close()
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))

@@ -36,13 +36,6 @@ def scalar(monkeypatch):
     return LoopConfig(env="Scalar-v0")
 
 
-def test_it_is_printed_as_one_line():
-    played = evaluate(CRUISE, zero, 3, 1)
-    mean = np.mean([episode.episode_return for episode in played.episodes])
-    text = f"<Evaluation: 3 episodes of 600 steps in all, 0 with a violation, mean return {mean:.4g}>"
-    assert str(played) == repr(played) == text
-
-
 def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
     make_vec, seeds = gym.make_vec, []
 

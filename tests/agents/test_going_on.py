@@ -63,6 +63,7 @@ def test_training_goes_on_from_an_agent(loop):
         train(loop, 512, 0, hyperparams=SMALL | {"policy_kwargs": {"net_arch": [8]}}, start=first)
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
 def test_agent_that_a_training_goes_on_from_stays_as_it_is(loop, algorithm):
     small = SMALL if algorithm == "PPO" else REPLAY | {"policy_kwargs": {"net_arch": [8]}}

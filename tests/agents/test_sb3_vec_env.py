@@ -274,6 +274,7 @@ class Laps(gym.Env):
         return np.zeros(1, np.float32), 0.0, False, ends, info | ({"end": float(self.steps)} if ends else {})
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("nested", [True, False])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_infos_are_those_that_each_environment_reported(mode, nested):

@@ -72,7 +72,7 @@ def test_monitored_training_is_the_unshielded_one_and_counts_what_the_shield_wou
     assert one.interventions > 0
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("algorithm", "settings", "again"),
     [
@@ -111,6 +111,7 @@ def test_rate_falls_from_its_full_value_to_that_of_the_last_rollout_unless_it_is
     assert constant.checksum != falling.checksum
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("change", [{"ent_coef": 0.1}, {"normalize": {"norm_reward": False}}, None])
 def test_entropy_normalization_of_rewards_and_violation_penalty_change_what_is_learned(change):
     loop = LoopConfig(env=CRUISE.env, violation_penalty=5.0 * (change is None))
@@ -195,6 +196,7 @@ def logged_alike(model, steps, log_interval, **more):
     return callback
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("kind", ["SB3VecEnv", "make_vec_env"])
 def test_logs_are_about_all_steps_since_the_last_one(kind):
     monitored = shielded("monitor")

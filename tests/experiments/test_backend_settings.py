@@ -2,9 +2,7 @@ import sys
 
 import pytest
 
-from experiments.__main__ import COMMANDS
 from experiments.commands.compare import CompareSettings
-from experiments.commands.sweep import SweepSettings
 from experiments.runs.training_run import TrainingRun
 from experiments.settings import BackendSettings, lasting_settings
 from tests.command import assert_one_sentence, ncs
@@ -24,8 +22,3 @@ def test_results_of_every_engine_have_the_same_key_and_provenance():
     assert names
     assert not names & set(TrainingRun.__dataclass_fields__)
     assert not names & lasting_settings(CompareSettings()).keys()
-
-
-def test_engines_are_offered_by_the_commands_with_many_runs():
-    kinds = {"compare": CompareSettings, "sweep": SweepSettings}
-    assert {name for name in COMMANDS if issubclass(kinds.get(name, object), BackendSettings)} == {"compare", "sweep"}

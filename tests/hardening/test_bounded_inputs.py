@@ -161,6 +161,7 @@ def grid_conditions(plant):
     return [each for each in found if each.name.startswith("(G)")]
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(("speed", "holds"), [(10.0, True), (300.0, True), (1000.0, True), (1e5, False)])
 def test_stiff_models_are_decided_in_numbers_of_bounded_length(speed, holds):
     conditions = grid_conditions(stiff(speed))
@@ -168,6 +169,7 @@ def test_stiff_models_are_decided_in_numbers_of_bounded_length(speed, holds):
     assert all(each.holds for each in conditions) == holds
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("speed", [3.0, 300.0])
 def test_bound_between_grid_points_is_hardly_more_than_it_has_to_be(speed):
     """The plant's own eta is one percent more than needed, of which the verification leaves most."""

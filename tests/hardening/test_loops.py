@@ -71,7 +71,7 @@ def pair(kind, certificate, loaded):
 
 @pytest.mark.parametrize("kind", ["scalar", "vector", "shield", "vector shield"])
 @given(moves=MOVES)
-@examples(12)
+@examples(6)
 def test_refused_actions_and_resets_move_nothing(kind, certificate, loaded, moves):
     (one, other), count = pair(kind, certificate, loaded)
     good = [move for move in moves if not move[0].startswith("bad")]
@@ -138,7 +138,7 @@ def stacked(env, names):
     start=st.sampled_from([None, *STARTS]),
     seed=st.integers(0, 1000),
 )
-@examples(25)
+@examples(12)
 def test_whatever_stands_around_a_guard_its_proof_is_right(certificate, loaded, inside, outside, mode, start, seed):
     """Where the shield says guaranteed the true state is in S, and it says so all along from a start in S."""
     bare = loop_env(loaded, Channel(0.5, quantization_step=0.05, delay=1), disturbance="adversarial")

@@ -75,19 +75,19 @@ def run_vector(settings, seed, steps, mode):
 
 
 @given(settings=environment_settings(), seed=st.integers(0, 1000))
-@examples(25)
+@examples(8)
 def test_random_environments_run(settings, seed):
     run_scalar(settings, seed, 25)
 
 
 @given(settings=environment_settings(), seed=st.integers(0, 1000), mode=st.sampled_from(["NextStep", "SameStep"]))
-@examples(15)
+@examples(5)
 def test_random_vector_environments_run(settings, seed, mode):
     run_vector(settings, seed, 16, mode)
 
 
 @given(settings=environment_settings(most_states=3, units=3.0), seed=st.integers(0, 1000))
-@examples(8)
+@examples(4)
 def test_random_environments_pass_the_checks_of_gymnasium(settings, seed):
     env = made(loop_env, **settings)
     if env is not None:
@@ -105,7 +105,7 @@ def test_many_random_environments_run(settings, seed, mode):
 
 
 @given(plant=plants(most_states=4, radius=(1.0, 1.5), units=3.0), age=st.integers(0, 3), seed=st.integers(0, 1000))
-@examples(6)
+@examples(3)
 def test_unstable_plants_are_refused_or_stay_finite_when_their_contract_is_broken(plant, age, seed):
     contract = ChannelContract(age, quantization_step=0.05)
     settings = {"plant": plant, "channel": Channel(1.0), "contract": contract}

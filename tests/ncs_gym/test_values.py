@@ -27,21 +27,6 @@ MODEL, ABOUT = Model(A, B, None, dt=0.1), Model(A, B, None, dt=0.1, at=([1.0, 2.
 LIMITS, BOUNDS = Limits(state=[1.0, 2.0], input=1.0), Bounds([0.01, 0.02], 0.01, 0.02)
 
 
-def around_a_point():
-    rows = [([1.0, 1.0], None, 0.0, 4.0), ([1.0, 0.0], [1.0], 0.0, 3.0)]
-    return LinearPlant(ABOUT, Limits(([0.0, 1.0], [2.5, np.inf]), (0.0, 2.0), rows), BOUNDS)
-
-
-def test_limits_around_a_point_are_absolute_and_keep_both_ends():
-    plant = around_a_point()
-    np.testing.assert_allclose(plant.own_limits, [[-1.0, -1.0], [1.5, np.inf]])
-    np.testing.assert_array_equal(plant.input_ends, [[-0.5], [1.5]])
-    np.testing.assert_allclose(plant.box[2] @ np.ones(2) / plant.box_ends[:, 2], 2.0 / np.array([-3.0, 1.0]))
-    np.testing.assert_allclose(
-        plant.mixed_rows[0] @ [1.0, 0.0, 1.0] / plant.mixed_ends[:, 0], 2.0 / np.array([-1.5, 1.5])
-    )
-
-
 def test_constants_of_a_model_are_at_rest_at_its_point():
     x, u = np.array([1.0, 2.0]), np.array([0.5])
     c = x - A @ x - B @ u
@@ -114,7 +99,6 @@ def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
         (lambda: LinearPlant(ABOUT, LIMITS, BOUNDS), "as beside at= of a Model, where"),
         (lambda: LinearPlant(MODEL, Limits((-1.0, 5.0), 1.0), BOUNDS), "positive half-widths"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], (0.0, 5.0)), BOUNDS), "limits are absolute"),
-        (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], (-np.inf, 5.0)), BOUNDS), "input limits must be finite"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], 1.0, [([0.0, 1.0], [0.0], -1.0, 1.0)]), BOUNDS), "something"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], 1.0, between_samples=4), BOUNDS), "between_samples needs"),
         (lambda: LinearPlant(MODEL, Limits([1.0, 2.0], np.inf), BOUNDS), "must be finite"),
@@ -125,7 +109,6 @@ def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
         (lambda: Model(A, B, None, 0.1, at=3.0), "at must be a pair"),
         (lambda: Model(csr_array(A), B, None, 0.1), "A must be a matrix of numbers"),
         (lambda: Model(A, B, None, 0.1, at=[0.5, 0.0]), r"the state in at=\(state, input\) must have shape"),
-        (lambda: Model(A, B, None, 0.1, continuous=A), "^continuous must have shape"),
         (lambda: Model.sampled(A, B, [[1.0]], 0.1), "^C must have shape"),
         (lambda: Model.of(A, 0.1), "^the system must be a state-space model"),
         (lambda: MODEL.held(np.eye(2)), "in continuous time"),

@@ -70,7 +70,7 @@ def test_both_verifiers_prove_ellipsoid_and_polytope(name):
     assert wide.provenance["polytope_share_of_box"] < found(name)[2].provenance["polytope_share_of_box"]
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", IDS)
 @pytest.mark.parametrize("kind", [1, 2])
 @pytest.mark.parametrize("mode", ["project", "switch"])

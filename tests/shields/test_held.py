@@ -64,6 +64,7 @@ def ages_of(certificate):
     return sorted({0, len(certificate.proofs) - 1})
 
 
+@pytest.mark.cases(6)
 @pytest.mark.parametrize(("name", "kind"), KINDS)
 def test_loop_rests_unchanged_just_inside_and_is_overridden_just_outside(name, kind):
     plant, certificate = certified(name, kind)
@@ -105,6 +106,7 @@ def equilibria_at(directions, state, value, rng):
     return point + sizes * rng.standard_normal((60, others.shape[1])) @ others.T
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", ["BatchReactor", "CSTR", "oscillator", TWO_ENDS])
 def test_range_is_that_of_a_linear_program_in_states_and_inputs(name):
     """With states and inputs as variables, the limits of the test, and errors and disturbances by their supports."""

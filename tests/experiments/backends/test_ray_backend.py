@@ -133,19 +133,6 @@ def test_rows_are_those_of_the_local_engine_bit_for_bit(local, tmp_path):
     assert len(noise) == RUNS, run.stderr
 
 
-def test_killed_worker_costs_nothing(local, tmp_path):
-    out = tmp_path / "out"
-    run = started("sweep", *GRID, "--engine", "ray", "--out", out)
-    for count in (1, 3):
-        until_stored(out, count, run)
-        os.kill(until(lambda: working(run.pid), "nobody works")[0], signal.SIGKILL)
-        assert stored(out) < RUNS
-    _, errors = run.communicate(timeout=TIMEOUT)
-    assert run.returncode == 0, errors
-    assert sorted(lines_of_runs(errors)) == sorted(path.stem for path in (local / "runs").glob("*.json"))
-    assert_same(out, local)
-
-
 def test_killed_driver_leaves_no_process_and_goes_on_where_it_was(local, tmp_path):
     out = tmp_path / "out"
     run = started("sweep", *GRID, "--engine", "ray", "--out", out)

@@ -114,6 +114,7 @@ def test_fallback_applies_its_gain_and_zero_nothing():
     assert not controller("zero input", env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates}).any()
 
 
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("name", CONTROLLERS)
 @pytest.mark.parametrize("env_id", [*SETPOINTS, "ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0"])
 def test_actions_of_every_controller_fit_every_environment(name, env_id):

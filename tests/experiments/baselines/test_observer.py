@@ -51,6 +51,7 @@ def offset(env, name, steps=250):
     return abs(np.mean(errors[-50:])) / 0.2
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("plant", PLANTS)
 @pytest.mark.parametrize("name", ["lqr", "mpc"])
@@ -75,6 +76,7 @@ def seen(env, alpha, seed=0):
     return np.mean(disturbances[300:], axis=0) - PUSH, late[300:].mean(axis=0)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("plant", PLANTS)
 def test_observer_converges_to_the_push_and_the_state(plant, network):
@@ -104,6 +106,7 @@ def test_estimates_stay_within_the_bound_and_begin_anew_with_an_episode():
     np.testing.assert_allclose(np.abs(observer.see(infos)[1]), np.tile(largest, (2, 1)))
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("env_id", ["ncs_gym/Convoy-v0", "ncs_gym/CartPoleTwoWay-v0", "ncs_gym/TruckTrailerCruise-v0"])
 def test_without_gain_the_observer_changes_nothing(env_id):
     env, loop = ncs_env(gym.make(env_id)), LoopConfig(env=env_id)

@@ -51,7 +51,6 @@ def test_table_has_every_channel_and_their_sum(tmp_path):
         assert rows[name.removeprefix("CartPole-v0, ")][5] == f"{counts['overridden'] / 1600:.1%}"
         assert counts["overridden"] > 0.25 * counts["steps"]
         assert counts["outside S"] == counts["guaranteed outside S"] == counts["lost"] == 0
-    assert rows != rows_of(succeeded("attack", "--env", CART, "--steps", 4_800, "--seed", 1))
 
 
 def test_a_short_version_attacks_one_environment():
@@ -76,6 +75,7 @@ def test_lookahead_may_leave_the_safe_set_and_keeps_the_box():
     assert others == ["0", "0"]
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("said", "words"),
     [
@@ -183,7 +183,7 @@ def first_errors(plant: LinearPlant) -> np.ndarray:
     return errors
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("bound", "use"),
     [

@@ -1,6 +1,5 @@
 """The command that draws an episode, and the policies it plays."""
 
-import importlib.util
 from dataclasses import replace
 
 import gymnasium as gym
@@ -14,7 +13,7 @@ from experiments.commands.render import RenderSettings, render
 from experiments.runs.policies import policy_by_name
 from ncs_gym import Channel
 from ncs_gym.rendering import theme
-from tests.command import assert_one_sentence, ncs, succeeded
+from tests.command import succeeded
 from tests.product import safety_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -113,12 +112,3 @@ def test_settings_that_an_agent_was_trained_with_are_named(model, tmp_path, caps
 def test_model_of_another_environment_is_refused(model):
     with pytest.raises(ValueError, match=r"was trained in ncs_gym/TruckTrailerCruise-v0, not in ncs_gym/CartPole-v0"):
         policy_by_name(str(model[0]), "ncs_gym/CartPole-v0", gym.make("ncs_gym/CartPole-v0").unwrapped, 0)
-
-
-def test_missing_pygame_is_one_sentence(tmp_path, monkeypatch):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *rest: find(name, *rest) if name != "pygame" else None
-    )
-    run = ncs("render", cwd=tmp_path)
-    assert_one_sentence(run, "this command needs pygame", "pip install -e '.[render]'")

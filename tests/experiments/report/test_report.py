@@ -3,8 +3,6 @@ import json
 import re
 from html.parser import HTMLParser
 
-from jinja2 import UndefinedError
-
 from experiments.report.html import comparison_report
 from shields import Report
 from shields.verification.condition import flag
@@ -69,16 +67,12 @@ def test_page_is_well_formed_and_needs_nothing_from_elsewhere():
     assert any(attributes.get("name") == "viewport" for _, attributes in reader.tags)
 
 
-def attacked(value, text, path=()):
-    """Pairs of a path and a copy of a JSON value with `text` in one place: instead of a leaf, or as a key more."""
-    yield path, text
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield (*path, key, "as a key"), {text if other == key else other: value[other] for other in value}
-            yield from ((at, value | {key: change}) for at, change in attacked(inner, text, (*path, key)))
-    elif isinstance(value, list):
-        for i, inner in enumerate(value):
-            yield from ((at, [*value[:i], change, *value[i + 1 :]]) for at, change in attacked(inner, text, (*path, i)))
+def attacked(value, text, path):
+    """A copy of a JSON value with `text` in one place: instead of what is there, or as its key."""
+    first, *rest = path
+    if rest == ["as a key"]:
+        return {text if other == first else other: value[other] for other in value}
+    return value | {first: attacked(value[first], text, rest) if rest else text}
 
 
 TEXTS = {
@@ -97,21 +91,15 @@ TEXTS = {
 BREAKOUTS = " ".join((ATTACK, '"><script>1</script>', "' onerror='1", "</code></td><img src=x>", "</style>"))
 
 
-def test_a_text_anywhere_in_a_summary_stays_text():
+def test_a_text_of_a_summary_stays_text():
     summary = summary_of({name: [run(name)] for name in ("unshielded", "shielded")})
     summary["references"] = {"zero input": summary["arms"]["unshielded"] | {"train_steps": 0}}
     summary = json.loads(json.dumps(summary))
     honest = tags_of(comparison_report(summary, VERIFIED, {"a": ("A. B.", PNG)}, []))
-    shown = set()
-    for path, change in attacked(summary, BREAKOUTS):
-        try:
-            page = comparison_report(change, VERIFIED, {"a": ("A. B.", PNG)}, [])
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError, UndefinedError):
-            continue  # no page is as good as a harmless one
+    for path in TEXTS:
+        page = comparison_report(attacked(summary, BREAKOUTS, path), VERIFIED, {"a": ("A. B.", PNG)}, [])
         assert tags_of(page) <= honest, path
-        if BREAKOUTS in "".join(Reader(page).text):
-            shown.add(path)
-    assert shown >= TEXTS
+        assert BREAKOUTS in "".join(Reader(page).text), path
 
 
 def tags_of(page):

@@ -102,7 +102,7 @@ def test_lagrangian_has_its_settings_and_starts_at_its_multiplier(run_of):
     assert run_of("unshielded", lagrangian=settings).training_loop.lagrangian is None
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", ["trusting", "shield at test", "lagrangian", "lqr+trusting"])
 def test_every_arm_plays(run_of, name):
     tiny = dict(n_envs=2, n_steps=64, batch_size=64, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))

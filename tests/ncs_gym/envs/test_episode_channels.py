@@ -56,7 +56,7 @@ def test_downlink_of_an_episode_is_as_if_the_environment_were_made_with_it():
     np.testing.assert_array_equal(of_made(downlink=late), both(downlink=late, downlink_contract=contract)())
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("channels", [LATE, JITTERY])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_vector_with_a_channel_for_each_environment_equals_scalar_ones(channels, mode):

@@ -115,6 +115,7 @@ def assert_moves_alike(one, other):
         np.testing.assert_array_equal(reward, same_reward)
 
 
+@pytest.mark.cases(14)
 @pytest.mark.parametrize(
     ("env_id", "settings"), [(LINEAR, each) for each in SETTINGS] + [(TRUCK, each) for each in OF_TRUCKS]
 )
@@ -134,6 +135,7 @@ def test_loaded_spec_makes_the_same_environment_again(env_id, settings):
     assert vector.channel == made.unwrapped.channel
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
 def test_spec_of_a_registered_plant_is_json(settings, register):
     register("Plants/Own-v0", own_plant(), max_episode_steps=20, **settings)

@@ -120,7 +120,7 @@ ENVIRONMENTS = (
 )
 
 
-@pytest.mark.cases(12)
+@pytest.mark.cases(8)
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_equals_scalar_environments_with_the_same_draws(name):
     env = ENVIRONMENTS[name]()

@@ -51,7 +51,7 @@ def steps_back(plant, contract, outage, period):
     return steps
 
 
-@pytest.mark.cases(8)
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("contracts", [2, 10, 100])
 @pytest.mark.parametrize("name", IDS)
 def test_registered_plants_come_back(name, contracts):
@@ -60,7 +60,7 @@ def test_registered_plants_come_back(name, contracts):
         assert steps_back(plant, contract, contracts * contract.max_age, period) <= 70
 
 
-@pytest.mark.cases(6)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("seed", range(12))
 def test_random_unstable_plants_come_back(seed):
     plant, contract = unstable(seed)

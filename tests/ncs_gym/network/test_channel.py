@@ -27,15 +27,6 @@ def test_without_losses_every_sample_arrives_after_its_delay(delay, period):
     assert arrivals == {step: [step - delay] if step - delay in sent else [] for step in range(1, 21)}
 
 
-def test_loss_has_the_asked_rate():
-    delivered = sum(len(stamps) for stamps in transmit(Channel(loss=0.3), 20_000).values())
-    assert delivered / 20_000 == pytest.approx(0.7, abs=0.015)
-
-
-def test_blackout_delivers_nothing():
-    assert not any(transmit(Channel(loss=1.0), 500).values())
-
-
 def test_jitter_delays_within_its_range_and_lets_packets_overtake():
     channel = Channel(delay=1, jitter=3)
     arrivals = transmit(channel, 4000)
@@ -66,6 +57,7 @@ def test_gilbert_elliott_loses_in_bursts_at_its_stationary_rate():
     assert np.mean(bursts) == pytest.approx(5.0, rel=0.1)  # 1 / p_bad_to_good
 
 
+@pytest.mark.cases(10)
 @pytest.mark.parametrize("most", [None, 0, 1, 3, 40])
 @pytest.mark.parametrize(
     ("loss", "period"),
@@ -90,12 +82,6 @@ def test_gilbert_elliott_starts_from_its_stationary_distribution():
     loss = GilbertElliott(p_good_to_bad=1e-9, p_bad_to_good=1e-9)
     first = [bool(transmit(Channel(loss=loss), 1, seed)[1]) for seed in range(400)]
     assert np.mean(first) == pytest.approx(0.5, abs=0.1)
-
-
-def test_gilbert_elliott_with_equal_losses_is_bernoulli():
-    loss = GilbertElliott(p_good_to_bad=0.3, p_bad_to_good=0.3, loss_good=0.4, loss_bad=0.4)
-    delivered = sum(len(stamps) for stamps in transmit(Channel(loss=loss), 20_000).values())
-    assert delivered / 20_000 == pytest.approx(0.6, abs=0.015)
 
 
 def test_quantizer_rounds_to_multiples_within_half_a_step():

@@ -269,7 +269,7 @@ def test_file_that_is_not_certain_is_refused_in_one_sentence(content, words, wri
         assert 'others are in the documentation under "Contracts and recorded networks"' in str(refusal.value)
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.sampled_from(sorted(KINDS)),
     edits=st.lists(st.tuples(st.integers(0, 10**6), st.binary(max_size=4)), min_size=1, max_size=6),
@@ -292,7 +292,7 @@ RECORDS = st.lists(
 ).filter(lambda record: any(gap for gap, _ in record[1:]))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(record=RECORDS)
 def test_replay_in_an_environment_has_the_ages_of_the_record(record):
     sent = np.cumsum([0, *(gap for gap, _ in record[1:])]) / 4  # in quarters of a step

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.analysis.stalls import broken_contracts, count_interval, stalls
-from ncs_gym import Channel, ChannelContract, PacketLog, TraceChannel, contract_of
+from ncs_gym import Channel, PacketLog, TraceChannel, contract_of
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 
 
@@ -66,22 +66,6 @@ def test_replay_is_the_record_from_a_random_packet_on():
 def test_longest_run_of_losses_counts_across_the_end():
     assert TraceChannel(trace=(-1, 0, 0, -1, -1)).max_consecutive_losses == 3
     assert contract_of(TraceChannel(trace=(-1, -1))) is None
-
-
-def test_record_is_replayed_in_an_environment_single_and_vectorized_within_its_contract():
-    channel = TraceChannel(trace=(1, -1, 2, 1, -1, -1, 1), quantization_step=1e-4)
-    settings = {"contract": ChannelContract(8, 1e-4), "terminate_on_violation": False}
-    env = gym.make("ncs_gym/CartPole-v0", channel=channel, **settings)
-    promised = contract_of(channel)
-    assert promised is not None
-    env.reset(seed=0)
-    ages = [env.step(np.zeros(1))[4]["measurement_age"] for _ in range(60)]
-    assert max(ages) <= promised.max_age
-    vector = gym.make_vec("ncs_gym/CartPole-v0", num_envs=5, channel=channel, **settings)
-    vector.reset(seed=0)
-    ages = np.stack([vector.step(np.zeros((5, 1), np.float32))[4]["measurement_age"] for _ in range(60)])
-    assert ages.max() <= promised.max_age
-    assert len({tuple(row) for row in ages.T[:, :7]}) > 1  # from different packets on
 
 
 def test_stalls_are_counted_once_with_their_length_and_rate():

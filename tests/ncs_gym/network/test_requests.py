@@ -56,6 +56,7 @@ def oldest_age(kind, losses, shortest, longest, beyond, input_delay):
     return oldest, len(seen)
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("input_delay", [0, 1, 2])
 def test_no_requests_losses_and_delays_make_a_sample_older_than_the_contract_allows(input_delay):
     count = 0

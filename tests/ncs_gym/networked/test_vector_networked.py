@@ -45,7 +45,7 @@ def same(one, other):
     return np.array_equal(one, other)
 
 
-@pytest.mark.cases(10)
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "dict"])
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
 def test_one_environment_is_that_of_the_single_network(env_id, settings):

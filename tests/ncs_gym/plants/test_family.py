@@ -197,6 +197,7 @@ def tank(k, delay=0, level=None, **more):
     return sampled_plant(model, **settings | QUIET | more)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("delay", [0, 1])
 @pytest.mark.parametrize("kind", ["function", "plants"])
 def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolute_coordinates(kind, delay):
@@ -314,6 +315,7 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
         LinearPlant.load(document)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     ("changed", "name"),
     [

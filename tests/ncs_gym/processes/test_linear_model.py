@@ -169,6 +169,7 @@ def test_shielded_tank_stays_between_its_ends_whatever_disturbs_it():
     assert 1.3 < max(reached) <= 2.0
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("past", [{"du_max": 0.3}, {"input_delay": 2}, {"du_max": 0.3, "input_delay": 1}])
 def test_past_inputs_are_kept_beside_the_process_which_moves_the_others(past):
     """What is left of a step of the tank, with the input that acts, is the declared disturbance."""

@@ -89,7 +89,7 @@ def steps_of(env, count, action=0.0):
     return [env.step(np.full(env.action_space.shape, action, np.float32))[4] for _ in range(count)]
 
 
-@pytest.mark.cases(5)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("env_id", DRAWN)
 def test_every_environment_draws_frames_that_follow_it(env_id):
     env = make(env_id)

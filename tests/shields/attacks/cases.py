@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 
 from ncs_gym import (
-    AdversarialDisturbance,
     Channel,
     ChannelContract,
     Ellipsoid,
@@ -185,8 +184,3 @@ def plan_case(name: str, channel: str) -> tuple[LinearPlant, int, Channel, Chann
 def box_ellipsoid(plant: LinearPlant, share: float) -> Ellipsoid:
     """An ellipsoid in the box that reaches a fraction of each half-width; far larger than S where S is small."""
     return Ellipsoid(share**2 * np.diag(plant.half_widths**2))
-
-
-def harmful(plant: LinearPlant, contract: ChannelContract | None = None) -> AdversarialDisturbance:
-    """The product's own disturbance that pushes the next state farthest out of S."""
-    return AdversarialDisturbance(certificate_of(plant, contract).M)

@@ -126,7 +126,7 @@ def largest_level(plant, certificate, x_hat, shape, plan, step, rng):
     return certificate.safe_set.gauge(ends).max()
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(2)
 def test_plans_are_certified_if_every_possible_state_stays_in_the_box_and_ends_in_the_safe_set(case):
     # The box part is exact: where it fails, an error and disturbances leave the box; else the end must be close to S.
     plant, certificate, test = case
@@ -289,7 +289,7 @@ def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case
     assert SMALLEST_RADIUS <= test.tightenings_of(size * shape).radius.item() < 1.01 * SMALLEST_RADIUS
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("size", [1.0, 1e4, 1e7, 1e10])
 @pytest.mark.parametrize(
     ("where", "steps", "margin"),

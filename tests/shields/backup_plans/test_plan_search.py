@@ -72,7 +72,7 @@ def best_distance(shield, x_hat, shape, proposed, length):
     return plant.u_max[0] * np.sqrt(max(problem.value, 0.0)) if problem.status == cp.OPTIMAL else np.inf
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")
 @pytest.mark.parametrize("name", NAMES)
 def test_input_applied_is_as_close_to_the_proposal_as_an_independent_solver_gets(name):
@@ -338,7 +338,7 @@ def break_solver(monkeypatch, how, rng):
     monkeypatch.setattr(clarabel, "DefaultSolver", broken_solver(how, rng))
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("how", FAILURES)
 def test_a_solver_that_fails_means_a_certified_plan_or_the_stored_one(how, monkeypatch):
     shield, rng = shield_of("cart-pole"), np.random.default_rng(6)
@@ -359,7 +359,7 @@ def test_a_solver_that_fails_means_a_certified_plan_or_the_stored_one(how, monke
     assert sum(one.reason == "planned" for one in working) > sum(one.reason == "planned" for one in failing)
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.filterwarnings("ignore::ncs_gym.network.packet_reception.UnusedPacketsWarning")
 @pytest.mark.parametrize("how", FAILURES)
 def test_no_failure_of_the_solver_leaves_the_box(how, monkeypatch):

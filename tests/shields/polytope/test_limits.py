@@ -39,7 +39,7 @@ def test_file_keeps_it(name, tmp_path):
     assert "Infinity" not in (tmp_path / "c.json").read_text()
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("name", PLANTS)
 def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
     plant, found = PLANTS[name], certificate(name)
@@ -78,7 +78,7 @@ def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
     assert ("fallback" if name == "hill" else "projected") in reasons  # a step moves little of the speed on a hill
 
 
-@pytest.mark.cases(9)
+@pytest.mark.cases(5)
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "lookahead"])
 @pytest.mark.parametrize("name", PLANTS)
 def test_no_limit_is_passed_while_guaranteed(name, mode):

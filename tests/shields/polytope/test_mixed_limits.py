@@ -54,6 +54,7 @@ def test_fallback_keeps_every_limit_from_every_state_by_linear_programs(name):
             assert -best.fun + sign * constant + reach <= end + 1e-9
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", ["rates", "feedthrough", "coupled"])
 def test_without_the_limit_in_the_certificate_it_is_passed(name):
     """The negative twin: a shield that does not know the limit, in the same runs."""
@@ -73,6 +74,7 @@ def test_without_the_limit_in_the_certificate_it_is_passed(name):
     assert passed > 100
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", ["rates", "feedthrough", "coupled"])
 def test_unshielded_steps_beyond_a_limit_are_counted(name):
     plant, rng = PLANTS[name], np.random.default_rng(1)
@@ -90,6 +92,7 @@ def test_unshielded_steps_beyond_a_limit_are_counted(name):
     assert counted > 5
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("name", MIXED)
 def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name):
     plant, found = PLANTS[name], certificate(name)
@@ -106,6 +109,7 @@ def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name)
         assert not verified(each, claims).valid
 
 
+@pytest.mark.slow
 def test_stable_plant_with_limits_of_rates_needs_no_contract():
     plant = PLANTS["rates"]
     assert plant.spectral_radius < 1.0
@@ -132,6 +136,7 @@ def test_episode_begins_with_the_operating_input_as_the_one_before():
         assert info["state"][:2].all()
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 def test_limit_of_rates_is_kept_behind_a_downlink(mode):
     plant = PLANTS["rates"]

@@ -119,6 +119,7 @@ def small_plant(**changes):
     return linear_plant(**(given | noise | changes))
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("again", [[1.0, 0.0], [1.0, 1e-9], [2.0, 0.0]])
 def test_box_with_nearly_the_same_row_twice_has_its_polytope(again):
     plant = small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], again]))
@@ -186,6 +187,7 @@ def slow_plant():
     )
 
 
+@pytest.mark.slow
 def test_polytope_of_too_many_rows_is_replaced_by_a_coarser_one_that_is_nearly_as_large(monkeypatch):
     plant, lines = slow_plant(), []
     monkeypatch.setattr(search, "MOST_ROWS", 12)

@@ -78,6 +78,7 @@ def test_parallel_rows_do_not_hide_the_closest_point():
         np.testing.assert_allclose(found, once, atol=1e-9)
 
 
+@pytest.mark.cases(5)
 @pytest.mark.parametrize("name", ALL)
 @pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
 def test_batches_decide_as_single_loops(name, mode):

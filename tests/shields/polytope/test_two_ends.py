@@ -144,6 +144,7 @@ def mutants(name):
     yield "center", replace(found, resting_state=shifted, polytope=replace(P, center=shifted))
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", ASYMMETRIC)
 def test_changed_certificate_is_refused_by_both_engines(name):
     plant, count, refused = PLANTS[name], 0, 0
@@ -250,6 +251,7 @@ def test_state_without_a_limit_is_bounded_by_what_the_others_allow():
     assert np.isfinite(found.polytope.widths).all()
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("points", [None, 4])
 def test_limits_with_two_ends_hold_between_samples_and_behind_a_delay(points):
     model = ([[0.0, 1.0], [0.0, -1.0]], [[0.0], [2.0]], np.eye(2), 0)

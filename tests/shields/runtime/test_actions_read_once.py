@@ -36,6 +36,7 @@ class Shifting:
         return np.full(self.shape, 0.0 if self.asked == 1 else 1.0, dtype or np.float64)
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("mode", ["project", "lookahead", "monitor"])
 @pytest.mark.parametrize("shielded", [scalar, vector])
 def test_action_whose_numbers_change_is_asked_for_them_once(shielded, mode):

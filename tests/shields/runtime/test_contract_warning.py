@@ -62,6 +62,7 @@ def test_rounding_that_the_contract_does_not_allow_is_pointed_out(make, channel,
     assert len([each for each in caught if each.category is BrokenContractWarning]) == 1
 
 
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("make", [loop, shield, many_shields])
 @pytest.mark.parametrize(
     ("channel", "downlink"),
@@ -116,6 +117,7 @@ def test_channel_of_an_episode_that_breaks_the_contract_is_pointed_out_once(make
             env.reset(options={"channel": Channel(delay=4)})
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("outside", [True, False])
 def test_shield_keeps_its_guarantee_over_drawn_channels_and_says_where_it_is_lost(outside):
     fitting = [Channel(), Channel(loss=0.5, delay=1, max_consecutive_losses=2), Channel(delay=4, quantization_step=0)]

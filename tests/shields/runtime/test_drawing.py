@@ -36,8 +36,8 @@ def test_safe_set_is_in_the_picture_from_reset_on(certificate):
 def test_an_intervention_shows_in_its_frame_and_in_no_other(certificate):
     env = shielded(certificate)
     seen = set()
-    for k in range(30):
-        info = env.step(FULL_THROTTLE if k < 10 else np.zeros(1, np.float32))[4]
+    for k in range(12):
+        info = env.step(FULL_THROTTLE if k < 7 else np.zeros(1, np.float32))[4]
         tinted = count(env.render(), theme.SHIELD_FILL, theme.PLANT_VIEW) > 10_000
         assert tinted == info["shield_intervened"]
         seen.add(tinted)

@@ -31,7 +31,7 @@ LOOPS = {
 }
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     "name", [each if each == "truck" else pytest.param(each, marks=pytest.mark.slow) for each in LOOPS]

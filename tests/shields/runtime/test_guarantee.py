@@ -62,6 +62,7 @@ def decision(passed, fallback):
     return Decision(np.zeros(1), nothing, passed, fallback, nothing, "")
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", ["4000 kg", "n=4 m=3 p=2"])
 def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(name):
     plant, count, rng = (TRUCKS | RANDOM)[name], 200, np.random.default_rng(0)

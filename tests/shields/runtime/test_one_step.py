@@ -16,7 +16,9 @@ PLANTS = {"truck": truck_trailer(mass=4000.0)} | {
 }
 
 
-@pytest.fixture(scope="module", params=["truck", "2, 1", pytest.param("3, 2", marks=pytest.mark.slow), "4, 3"])
+@pytest.fixture(
+    scope="module", params=["truck", *(pytest.param(key, marks=pytest.mark.slow) for key in ("2, 1", "3, 2")), "4, 3"]
+)
 def case(request):
     plant = PLANTS[request.param]
     return plant, certificate_of(plant)

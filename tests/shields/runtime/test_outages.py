@@ -61,6 +61,7 @@ class World:
         return guaranteed
 
 
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("length", [1, 2, 5, 10, 30])
 @pytest.mark.parametrize("downlink", [None, DOWNLINK])
 def test_outage_of_the_plant_ends_the_proof_for_the_episode(length, downlink):

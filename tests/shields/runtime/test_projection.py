@@ -65,10 +65,10 @@ def random_case(rng, m):
 
 @pytest.mark.cases(1)
 @pytest.mark.parametrize("m", [1, 2, 3, 5])
-def test_projection_agrees_with_a_conic_solver_in_a_thousand_cases(m):
+def test_projection_agrees_with_a_conic_solver_in_random_cases(m):
     rng = np.random.default_rng(m)
     compared = bound = failed = 0
-    for _ in range(1000):
+    for _ in range(400):
         wanted, offset, effect, radius, limit = random_case(rng, m)
         found = closest_admissible(wanted, offset, effect, radius, limit)
         try:
@@ -92,9 +92,9 @@ def test_projection_agrees_with_a_conic_solver_in_a_thousand_cases(m):
             a, b, c = (effect.T @ effect).item(), (effect.T @ offset).item(), float(offset @ offset)
             line = closest_on_line(wanted.item(), a, b, c, radius, limit.item())
             assert line == pytest.approx(found.item(), rel=1e-9, abs=1e-9)  # as the scalar shield does it
-    assert compared > 300
-    assert failed < 10
-    assert m == 1 or bound > 20  # cases in which an input limit binds too
+    assert compared > 120
+    assert failed < 4
+    assert m == 1 or bound > 8  # cases in which an input limit binds too
 
 
 def hard_case(rng):
@@ -110,16 +110,17 @@ def hard_case(rng):
 def test_projection_agrees_with_a_conic_solver_where_limits_bind():
     rng = np.random.default_rng(0)
     branched = 0
-    for _ in range(1000):
+    for _ in range(400):
         case = hard_case(rng)
         found, expected = closest_admissible(*case), conic_solution(*case)
         assert found is not None
         distance, best = np.linalg.norm(found - case[0]), np.linalg.norm(expected - case[0])
         assert distance <= best * (1 + 1e-4) + 1e-6
         branched += bool((np.abs(found) == 1.0).any())
-    assert branched > 200
+    assert branched > 80
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("m", [1, 2, 3, 4])
 def test_many_projections_at_once_are_those_one_by_one(m):
     rng, count, n, limit = np.random.default_rng(m), 400, 4, np.linspace(0.5, 1.5, m)
@@ -172,7 +173,7 @@ def test_units_of_inputs_that_are_held_do_not_matter(ratio):
 def test_converges_where_one_input_does_far_more_than_the_others(m):
     # By another route: the multiplier by bisection, in the axes of a singular value decomposition.
     rng = np.random.default_rng(0)
-    for _ in range(200):
+    for _ in range(80):
         effect = (np.eye(m) + 0.2 * rng.standard_normal((m, m))) * 10.0 ** rng.uniform(-4, 4, m)
         center = rng.standard_normal(m)
         offset = -effect @ center
@@ -207,17 +208,6 @@ def test_twelve_inputs_are_projected_too():
         assert np.linalg.norm(found - case[0]) <= np.linalg.norm(expected - case[0]) * (1 + 1e-4) + 1e-6
 
 
-@pytest.mark.parametrize("ratio", [1e3, 1e6, 1e9])
-def test_inputs_in_very_different_units_are_both_used(ratio):
-    units = np.array([1.0, ratio])
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        effect, offset = rng.standard_normal((2, 2)), rng.standard_normal(2)
-        radius = 0.5 * np.linalg.norm(offset)
-        found = closest_admissible(np.zeros(2), offset, effect / units, radius, 1e3 * units)
-        assert np.linalg.norm(offset + effect / units @ found) <= radius * (1 + 1e-6)
-
-
 def test_wanted_input_inside_is_returned_as_it_is():
     wanted = np.array([0.1, -0.2])
     found = closest_admissible(wanted, np.zeros(2), np.eye(2), 1.0, np.ones(2))
@@ -237,7 +227,7 @@ def test_out_of_reach_is_none():
 def test_closest_points_of_one_input_are_the_same_in_numbers_as_in_arrays():
     """Bit for bit, also of rows that no input moves, limits that leave nothing, and NaN."""
     rng, found = np.random.default_rng(0), []
-    for _ in range(2000):
+    for _ in range(800):
         rows = rng.integers(1, 6)
         effect = rng.standard_normal(rows) * rng.choice(
             [0.0, 5e-324, 1e-3, 1.0, 1e3], rows, p=[0.1, 0.05, 0.25, 0.3, 0.3]
@@ -250,4 +240,4 @@ def test_closest_points_of_one_input_are_the_same_in_numbers_as_in_arrays():
         alone = projection.closest_in_interval(wanted, offset.tolist(), effect.tolist(), limits.tolist())
         np.testing.assert_array_equal(alone, many.item())
         found.append(alone == wanted)
-    assert 200 < sum(found) < 1800
+    assert 80 < sum(found) < 720

@@ -129,7 +129,7 @@ def false_claims(trace: Trace, mode: str, kind: str, first: int = 0) -> list[str
     return wrong
 
 
-@pytest.mark.cases(8)
+@pytest.mark.cases(5)
 @pytest.mark.parametrize("kind", ["ellipsoid", "polytope"])
 @pytest.mark.parametrize("c", [0, 1, 2, 3])
 @pytest.mark.parametrize("mode", [*KEEPING, "monitor"])

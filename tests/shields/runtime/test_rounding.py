@@ -188,6 +188,7 @@ def test_gain_may_be_as_large_as_float64_computes_it_accurately(certificate, loa
         require_computable(replace(thin, K=1.01 * largest * np.array([[1.0, -1.0]])), loaded)
 
 
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("first_error", [0.0, 1e-6])
 @pytest.mark.parametrize("name", ["singular", "slanted"])
 def test_error_lies_in_its_ellipsoid_exactly_when_rounding_is_all_there_is(name, first_error):

@@ -8,7 +8,6 @@ from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 from tests.product import altered, safety_filter
-from tests.shields.attacks.cases import RANDOM
 from tests.shields.edges import edge_of
 from tests.shields.runtime.batches import decided_alike
 
@@ -120,19 +119,6 @@ def test_unusable_error_shape_gives_the_gain_and_no_promise(certificate, loaded,
     np.testing.assert_allclose(decision.input, np.ones(1) if mode == "monitor" else certificate.K @ estimate, atol=1e-6)
 
 
-def test_indefinite_error_shapes_of_three_states_are_unusable():
-    plant = random_plant(3, 3, 2)
-    shield = safety_filter(certificate_of(plant), plant)
-    swap = np.zeros((3, 3))
-    swap[0, 1] = swap[1, 0] = 0.1
-    for shape in (swap, 0.01 * np.eye(3) + swap, 4.0 * np.triu(swap) + 0.01 * np.eye(3)):
-        assert shield.decide(np.zeros(3), shape, np.zeros(2)).reason == "invalid"
-        assert not shield.knows_inside(np.zeros(3), shape)
-    skew = 1e-4 * np.eye(3) + np.array([[0.0, 1e-5, 0.0], [-1e-5, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    u = np.zeros(2)
-    assert shield.margin(u[[0, 0, 0]], skew, u) == pytest.approx(shield.margin(u[[0, 0, 0]], skew.T, u), abs=1e-15)
-
-
 @pytest.mark.cases(2)
 @pytest.mark.parametrize("plant", [STRONG, random_plant(3, 3, 2)], ids=["2, 1", "3, 2"])
 @pytest.mark.parametrize("size", [1e150, 1e308])
@@ -241,17 +227,6 @@ def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
     assert "fallback" in seen
 
 
-def test_boundary_trusts_weak_inputs_of_larger_plants_too():
-    plant = RANDOM["n=3 m=2 p=1"]
-    certificate = certificate_of(plant)
-    boundary, rng = safety_filter(certificate, plant, "boundary"), np.random.default_rng(0)
-    reasons = set()
-    for _ in range(200):
-        estimate = certificate.safe_set.sample(rng)
-        reasons.add(boundary.decide(estimate, 0.1 * certificate.Sigma, rng.uniform(-0.3, 0.3, 2)).reason)
-    assert reasons == {"safe", "fallback"}
-
-
 def test_the_test_is_passed_with_a_margin_or_not_at_all(certificate, loaded):
     shield = safety_filter(certificate, loaded, "switch")
     shape = 0.1 * certificate.Sigma
@@ -290,7 +265,7 @@ def random_cases(rng, shield, count):
     return estimates, shapes, inputs
 
 
-@pytest.mark.cases(6)
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     ("n", "m"),
@@ -313,14 +288,6 @@ def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
         "lookahead": {"safe", "planned"},
     }
     assert expected.get(mode, {"safe", "fallback"}) <= set(reasons)
-
-
-def test_empty_batches_give_empty_decisions(case):
-    plant, certificate = case
-    none = safety_filter(certificate, plant).decide_many(
-        np.zeros((0, plant.n)), certificate.Sigma, np.zeros((0, plant.m))
-    )
-    assert (none.input.shape, none.reason.shape, none.margin.shape) == ((0, plant.m), (0,), (0,))
 
 
 @pytest.mark.parametrize("mode", MODES)

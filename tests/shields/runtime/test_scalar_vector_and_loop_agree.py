@@ -172,7 +172,7 @@ ROWS = [
 ]
 
 
-@pytest.mark.cases(10)
+@pytest.mark.cases(7)
 @pytest.mark.filterwarnings("ignore:the channel may lose any number of packets in a row")
 @pytest.mark.parametrize(("name", "mode", "reset"), ROWS)
 def test_scalar_shields_vector_shields_and_loops_agree(name, mode, reset):

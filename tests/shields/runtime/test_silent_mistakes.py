@@ -13,12 +13,9 @@ from ncs_gym import Channel, Packet, RequestActions, VectorNetworked, VectorRequ
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from tests.certificates import certificate_of
 from tests.product import (
-    linear_plant,
     loop_env,
     safe_loop,
-    safety_filter,
     safety_shield,
-    synthesize,
     vector_env,
     vector_shield,
 )
@@ -29,24 +26,6 @@ PLANT, TWO = truck_trailer(mass=4000.0), np.zeros(2)
 @pytest.fixture(scope="module")
 def certificate():
     return certificate_of(PLANT)
-
-
-def test_stepping_after_the_end_of_an_episode_is_refused():
-    env = loop_env(PLANT, terminate_on_violation=True)
-    env.reset(options={"state": [1.9, 0.0]})
-    while not env.step([1.0])[2]:
-        pass
-    with pytest.raises(gym.error.ResetNeeded, match="the episode is over"):
-        env.step([1.0])
-    env.reset()
-    env.step([1.0])
-
-
-def test_batches_and_tensors_handed_to_a_filter_are_invalid(certificate):
-    shield = safety_filter(certificate, PLANT)
-    gradient = torch.zeros(1, requires_grad=True)
-    for estimate, proposed in ((np.zeros((5, 2)), np.zeros((5, 1))), (np.zeros(2), np.zeros((5, 1))), (TWO, gradient)):
-        assert shield.decide(estimate, certificate.Sigma, proposed).reason == "invalid"
 
 
 @pytest.mark.filterwarnings("error")
@@ -107,13 +86,6 @@ def test_channels_whose_packets_are_used_are_not_named():
     for step in (0.0, 0.05):
         loop_env(PLANT, Channel(quantization_step=step, delay=3))
         loop_env(cart_pole(full_state=False), Channel(loss=0.2, max_consecutive_losses=2))
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_bounds_of_zero_are_certified_without_a_word():
-    none = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
-    plant = linear_plant(A=[[1.0, 0.1], [-0.3, 0.85]], B=[[0.0], [0.1]], box=[1.0, 2.0], u_max=5.0, dt=0.1, **none)
-    assert synthesize(plant).provenance["share_of_box"] > 0.7
 
 
 def test_copy_of_a_loop_shares_nothing_with_it(certificate):

@@ -91,7 +91,7 @@ class Repeats(gym.Wrapper):
         return result
 
 
-@pytest.mark.cases(14)
+@pytest.mark.cases(8)
 @pytest.mark.parametrize("mode", ["project", "lookahead", "boundary", "switch"])
 @pytest.mark.parametrize("name", INSIDE)
 def test_no_wrapper_inside_the_shield_breaks_its_promise(name, mode):
@@ -266,7 +266,7 @@ def test_a_shield_that_is_refused_leaves_the_environment_bare():
     assert env.guard is shield.unwrapped.guard is not None
 
 
-@pytest.mark.cases(5)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("copied", COPIES)
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 @pytest.mark.parametrize("made", [scalar, vector])

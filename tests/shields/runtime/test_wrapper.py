@@ -159,6 +159,7 @@ def rewriting(kind):
     return Rewrites
 
 
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("rewrite", REWRITES)
 @pytest.mark.parametrize("autoreset", [None, pytest.param("NextStep", marks=pytest.mark.slow), "SameStep"])
 def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, autoreset, rewrite):
