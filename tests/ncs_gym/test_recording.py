@@ -6,13 +6,14 @@ import itertools
 import json
 import time
 from dataclasses import replace
+from importlib import import_module
 
 import cvxpy as cp
 import numpy as np
 import pytest
 
-import ncs_gym
-from ncs_gym import Limits, LinearPlant, Model, bounds_from_recording
+from ncs_gym import Limits, LinearPlant, Model, Through, bounds_from_recording
+from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.lqr import lqr_gain
 from tests.product import library_plant
 
@@ -43,9 +44,9 @@ def servo(H=((1.0, 0.0),)):
 
 def case_of(name):
     """A plant whose states are measured, directions, half-widths of its disturbance and of its sensors."""
-    plant = library_plant(getattr(ncs_gym, name))
+    plant = library_plant(getattr(import_module(f"ncs_gym.plants.{name}"), name))
     part = plant.bounds.disturbance.parts[0]
-    E = part.E if isinstance(part, ncs_gym.Through) else None
+    E = part.E if isinstance(part, Through) else None
     half = np.sqrt(np.diag(plant.disturbance.shape_matrix)) if E is None else part.set.half
     phi = np.full(plant.n, np.sqrt(plant.sensor_error.shape_matrix.diagonal().min()))
     if plant.p == plant.n:
@@ -92,7 +93,7 @@ def oracle(model, u, y, E=None):
 
 
 def test_outputs_alone_bound_disturbances_along_few_directions():
-    model = library_plant(ncs_gym.plants.batch_reactor.batch_reactor).model
+    model = library_plant(batch_reactor).model
     u, y, s = driven(model, 300, np.array([0.01, 0.02]), 1e-5, E=model.B)
     found = bounds_from_recording(model, u, y, model.B, sensor=1e-5)
     inner = np.abs(s[found.window : -found.window]).max(axis=0)

@@ -191,7 +191,7 @@ class LoopBeside:
             advance(u, self.packets)
 
         estimator.advance = overheard
-        self.loop.start(estimator.estimate.mean, initial_set=env.start)
+        self.loop.start(estimator.mean, initial_set=env.start)
         self.sent = info["packets"]
         self.assert_same(info)
 

@@ -168,15 +168,18 @@ def with_multipliers(certificate, **change):
 
 
 SOURCES = {"disturbance": "disturbance", "sensor": "sensor", "initial": "first_error"}
+NOISES = {"process": "disturbance", "sensor": "sensor", "initial": "first_error"}
 
 
 def replaced(plant, **values):
     """The plant with numbers or derived bounds replaced and nothing derived anew, as a faulty derivation leaves it."""
     assert plant.fingerprint
     assert plant.disturbance.dim == plant.initial_error.dim >= plant.sensor_error.dim
-    sources = {f"{kind}_bound": f"of_{source}" for kind, source in SOURCES.items()}
+    sources = {f"{kind}_bound": (f"of_{source}", "bound") for kind, source in SOURCES.items()}
+    sources |= {f"{kind}_noise": (f"of_{source}", "noise") for kind, source in NOISES.items()}
     for name in sources.keys() & values.keys():
-        values[sources[name]] = getattr(plant, sources[name])._replace(bound=values.pop(name))
+        source, part = sources[name]
+        values[source] = getattr(plant, source)._replace(**{part: values.pop(name)})
     faulty = object.__new__(type(plant))
     faulty.__dict__.update(plant.__dict__ | values)
     if "remainder" in values:
