@@ -76,8 +76,8 @@ def contracts(ages: Sequence[int] = (1, 4, 8, 16), out: Path | None = None) -> N
     """The largest disturbance that a gain bears, against the age that a contract allows, per unstable plant.
 
     Disturbance radii are in percent of the half-widths of the safe box; sensor noise and initial error are a hundredth
-    of that. Seconds are those of a whole synthesis, with exact verification, at two
-    thirds of that radius. With --out a figure of it, too.
+    of that. Seconds are those of a whole synthesis, with exact verification, at two thirds of that radius. With --out a
+    figure of it, too.
     """
     show = table("plant", "max_age", "radius / box", "vol/ellipsoid", "synthesis [s]", first=32)
     radii_of: dict[str, list[float]] = {}

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
+from scipy.linalg import LinAlgWarning, solve_discrete_lyapunov
 from scipy.optimize import minimize
 
 from ncs_gym import ChannelContract, LinearPlant, exact
@@ -269,14 +270,19 @@ def invariant_ellipsoid(problem: DesignProblem, K: np.ndarray) -> InvariantEllip
         above, fraction = 1.0 / (1.0 + np.exp(-np.clip(logits, -_LARGEST_LOGIT, _LARGEST_LOGIT)))
         lx = float(slowest + (1.0 - slowest) * above)
         le, ld = float((1.0 - lx) * fraction), float((1.0 - lx) * (1.0 - fraction))
-        L = solve_discrete_lyapunov(closed_loop / np.sqrt(lx), from_errors / le + problem.D_u / ld)
+        try:
+            L = solve_discrete_lyapunov(closed_loop / np.sqrt(lx), from_errors / le + problem.D_u / ld)
+        except np.linalg.LinAlgError:
+            L = np.full_like(closed_loop, np.inf)
         by_state = [np.sqrt(np.maximum(((rows @ L) * rows).sum(axis=1), 0.0)) for rows in (problem.C, K)]
         used = float(np.concatenate([by_state[0], by_state[1] + at_once]).max())
         return InvariantEllipsoid(K, 0.5 * (L + L.T), (lx, le, ld), 1.0 / used if used > 0.0 else 0.0)
 
     options = {"maxfev": _EVALUATIONS, "xatol": 1e-3, "fatol": 1e-6}
-    best = minimize(lambda logits: -at(logits).margin, np.array([-1.0, 0.0]), method="Nelder-Mead", options=options)
-    return at(np.round(best.x, _DIGITS))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LinAlgWarning)  # what is solved badly is verified exactly afterwards
+        best = minimize(lambda logits: -at(logits).margin, np.array([-1.0, 0.0]), method="Nelder-Mead", options=options)
+        return at(np.round(best.x, _DIGITS))
 
 
 def tolerated_gains(
