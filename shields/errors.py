@@ -47,8 +47,8 @@ class Infeasible(ValueError):
             violation of that condition.
         details: Further figures by name. Method "certified": `share_of_radii`, the fraction of the given radii that a
             gain was found to bear; `max_age`, the age of samples for which there is a certificate.
-            Method "paper": `ratio`, the largest lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_gamma`,
-            `largest_noise_scale` and `largest_scale`, the largest uncertainty for which OP is feasible.
+            Method "paper": `ratio`, the largest lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_scale`,
+            the largest factor on gamma, Q and P0 for which OP is feasible.
     """
 
     def __init__(self, message: str, binding: str, shortfall: float, details: dict[str, float] | None = None) -> None:

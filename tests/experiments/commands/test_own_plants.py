@@ -108,7 +108,7 @@ def test_arms_with_and_without_training_are_compared_where_limits_have_two_ends(
     arms = json.loads((folder / "c" / "summary.json").read_text())
     assert set(arms["references"]) == set(baselines)
     assert arms["arms"]["shielded"]["eval_violation_steps"] == 0
-    assert (folder / "c" / "figures" / "episode.png").is_file()
+    assert (folder / "c" / "figures" / "scatter.png").is_file()
 
 
 @pytest.mark.slow
