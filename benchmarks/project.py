@@ -50,7 +50,8 @@ def complexity() -> None:
     print(f"{sum(map(asks_for_feature, nodes))} branches ask whether a feature is there")
     case = "ncs_gym/TruckTrailerCruise-v0"
     for name, env in {"a step": gym.make(case), "a shielded step": SafetyShield(gym.make(case))}.items():
-        calls, changes = walked(step_of(env))
+        step = step_of(env)
+        calls, changes = sorted(walked(step) for _ in range(25))[12]  # the median: some work out what is met first
         print(f"{name}: {calls} calls, {changes} changes of module")
     plant = ncs_gym.truck_trailer(mass=4000.0)
     calls, changes = walked(lambda: synthesize(plant))

@@ -14,12 +14,12 @@ from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import Loop, OneLoop
 from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
 from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
-from ncs_gym.network.channel import Channel, require_on_request
+from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import no_inputs
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
-from ncs_gym.rendering import Renderer, sent_at
+from ncs_gym.rendering import Annotation, Renderer, sent_at
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -234,17 +234,18 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
             now.process.forget()
         now.give(sources)
         now.begin(self.np_random, start, fixed)
-        self._task_state = self._task.begin(self._draws_of_task(seed), self.plant)
+        self._begin_draws_of_task(seed)
+        self._task_state = self._task.begin(self._task_random, self.plant)
         info, guard = self._info(no_inputs(self.plant.m), False), self._guard
         if guard is not None:
             guard.begin(now.beginning(self._belief))
             info |= guard.info()
         self._consistent, self._over = True, False
         if self.renderer is not None:
-            self.renderer.begin(info, self._task_state, None if guard is None else guard.annotation())
+            self.renderer.begin(info, self._task_state, note_of(guard, info))
         observation = self._observation()
         if guard is not None:
-            guard.tell()
+            guard.lost.tell()
         return observation, info
 
     @np.errstate(all="ignore")
@@ -264,52 +265,24 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         guard = self._guard
         u = read[1] if guard is None else guard.input(read[1])
         inputs, arrived = now.move(self.np_random, u)
-        self._task_state = self._task.advance(self._draws_of_task(), self.plant, self._task_state, inputs.applied)
+        self._task_state = self._task.advance(self._task_random, self.plant, self._task_state, inputs.applied)
         reward = self._task.reward_one(self.plant, self._task_state, now.state, inputs.applied)
         info = self._info(inputs, arrived, read=read)
         if guard is not None:
             guard.observe(self._belief)
             info |= guard.info()
-            reward -= guard.charge
+            reward -= guard.penalty * info["shield_intervened"]
         process = now.process.process
         terminated = process.terminated or (self._terminate_on_violation and info["cost"] > 0.0)
         truncated = process.truncated
         self._consistent, self._over = True, terminated or truncated
         if self.renderer is not None:
             sent = sent_at(now.steps, now.network, now.received)
-            self.renderer.record(info, self._task_state, sent, None if guard is None else guard.annotation())
+            self.renderer.record(info, self._task_state, sent, note_of(guard, info))
         observation = self._observation()
         if guard is not None:
-            guard.tell()
+            guard.lost.tell()
         return observation, reward, terminated, truncated, info
-
-    def request(self, asked: bool = True) -> None:
-        """Asks for a sample in the next step, where the channel takes samples on request (docs/requests.md).
-
-        The request is decided together with the next action: without a downlink it is about the sample that the next
-        step ends with, behind one about that of c steps later. Where nobody asks, samples are requested only if the
-        contract needs them.
-
-        Raises:
-            ValueError: If the channel does not take samples on request, or what is given is no bool.
-        """
-        require_on_request(self._now.requests).ask(asked)
-
-    @property
-    def state(self) -> np.ndarray:
-        """The true state, shape (n,), a copy; only `reset(options={"state": x})` sets it."""
-        return self._now.state.copy()
-
-    @property
-    def outstanding(self) -> int:
-        """Number of samples requested that are newer than the newest one used (docs/requests.md, "The rule").
-
-        Under a contract lost ones count, too; without one those that cannot arrive any more do not.
-
-        Raises:
-            ValueError: If the channel does not take samples on request.
-        """
-        return int(require_on_request(self._now.requests).outstanding(self._now.estimator.age))
 
     @property
     def request_state(self) -> tuple[int, int]:
@@ -358,9 +331,25 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
 
     def _observation(self) -> np.ndarray:
         task_state = self._task_state
-        for u in self._now.pending:
+        for u in self._now.downlink.committed.pending:
             task_state = self._task.predict_one(self.plant, task_state, u)
         return self._observer.observation(self._belief, self._task.observe(task_state))
+
+
+def note_of(guard: Any, info: dict[str, Any], loop: int = 0) -> Annotation | None:
+    """Returns what the picture of the last step shows of a guard, given the info of a loop; None without a guard."""
+    if guard is None:
+        return None
+    judge = guard.filter
+    return Annotation(
+        safe_set=judge.certificate.safe_set,
+        label=judge.mode,
+        proposed=info["input_proposed"] if info["episode_steps"] > 0 else None,
+        intervened=bool(info["shield_intervened"]),
+        interventions=int(info["episode_interventions"]),
+        protects=judge.mode != "monitor",
+        plan=guard.plan(loop) if judge.mode == "lookahead" else None,
+    )
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

@@ -8,10 +8,10 @@ import numpy as np
 
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.loop import Loop, LoopState
-from ncs_gym.envs.report import Belief, Guard
+from ncs_gym.envs.report import Belief
 from ncs_gym.envs.spaces import actions_of
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.network.channel import Channel
+from ncs_gym.network.channel import Channel, require_on_request
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.network.downlink import DownlinkProtocol, Inputs
 from ncs_gym.plants.linear_plant import LinearPlant
@@ -39,17 +39,19 @@ class GuardedLoop:
     downlink_contract: ChannelContract | None = setting("downlink_contract", "_now.loop.downlink_contract")
     downlink_protocol: DownlinkProtocol = setting("downlink_protocol", "_now.loop.protocol")
     belief: Belief = setting("belief")
-    guard: Guard | None = setting("guard")
+    guard: Any = setting("guard")
 
     np_random: np.random.Generator  # of gymnasium
     _now: LoopState
-    _task_random: np.random.Generator | None = None
+    _task_random: Any = None
     _belief: Belief
-    _guard: Guard | None = None
+    # What decides the inputs: `shields.runtime.guard`. A step is `input` and then `observe`, a start is `begin`; `info`
+    # follows, and what it lost is told last, when the step has happened. None for an environment without a shield.
+    _guard: Any = None
     # Whether there is an episode that no exception has interrupted.
     _consistent = False
 
-    def install(self, guard: Guard) -> None:
+    def install(self, guard: Any) -> None:
         """Has a guard decide the inputs, from the next reset on; a shield does this.
 
         Raises:
@@ -59,11 +61,43 @@ class GuardedLoop:
             raise ValueError("the environment has a shield already: leave one out, or make an environment for each")
         self._guard, self._consistent = guard, False
 
-    def _draws_of_task(self, seed: int | None = None) -> np.random.Generator:
-        """Returns the task's own generator, so that what a task draws changes nothing in the loop; a seed renews it."""
+    @property
+    def state(self) -> np.ndarray:
+        """The true state, shape (n,) or (N, n), a copy; only `reset(options={"state": x})` sets it."""
+        return self._now.state.T.copy()
+
+    def request(self, asked: Any = True) -> None:
+        """Asks for a sample in the next step, where the channel takes samples on request (docs/requests.md).
+
+        The request is decided together with the next action: without a downlink it is about the sample that the next
+        step ends with, behind one about that of c steps later. Where nobody asks, samples are requested only if the
+        contract needs them.
+
+        Args:
+            asked: A bool; of many environments also a mask, shape (N,).
+
+        Raises:
+            ValueError: If the channel does not take samples on request, or what is given is no bool.
+        """
+        require_on_request(self._now.requests).ask(asked)
+
+    @property
+    def outstanding(self) -> Any:
+        """Number of samples requested that are newer than the newest one used (docs/requests.md, "The rule").
+
+        An int, or shape (N,). Under a contract lost ones count, too; without one those that cannot arrive any more do
+        not.
+
+        Raises:
+            ValueError: If the channel does not take samples on request.
+        """
+        found = require_on_request(self._now.requests).outstanding(self._now.estimator.age)
+        return found if found.ndim else found.item()
+
+    def _begin_draws_of_task(self, seed: int | None) -> None:
+        """Gives the task a generator of its own, so that what it draws changes nothing in the loop."""
         if seed is not None or self._task_random is None:
             self._task_random = self.np_random.spawn(1)[0]
-        return self._task_random
 
     def _info(self, inputs: Inputs, arrived: Any, counted: Any = None, read: Any = None) -> dict[str, Any]:
         """Returns `info`, and keeps the belief; see `LoopState.report` and `actions_of`."""

@@ -43,6 +43,9 @@ class Loop:
         protocol: How commands are sent over the downlink, with its `input_delay`: 0 for an ideal one.
         certificate_contract: Contract that a certificate for this loop rests on: `contract` with c steps added.
         error_set: Certified error set, or sets by age.
+        limits_the_way: Whether there are limits beyond those of states at samples: at all times, or of states and
+            inputs.
+        oldest: The largest age of the newest sample that the contract allows [steps]; infinite without one.
 
     Raises:
         UnstablePlantError: If the plant is not Schur stable and there is no contract.
@@ -63,6 +66,8 @@ class Loop:
     protocol: DownlinkProtocol = field(init=False)
     certificate_contract: ChannelContract | None = field(init=False)
     error_set: ErrorSet = field(init=False)
+    limits_the_way: bool = field(init=False)
+    oldest: float = field(init=False)
 
     def __post_init__(self) -> None:
         plant = expect(self.plant, LinearPlant, "plant")
@@ -88,6 +93,8 @@ class Loop:
             "certificate_contract": certificate_contract,
             "noise": as_noise(self.noise, plant),
             "downlink_contract": None if self.downlink is None else protocol.contract,
+            "limits_the_way": plant.between_samples is not None or len(plant.mixed_rows) > 0,
+            "oldest": largest_age(contract),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -105,16 +112,6 @@ class Loop:
     def histories(self, channel: Channel) -> ArrivalHistories:
         """Returns the graph of arrival histories that loops over a channel with these delays share."""
         return arrival_histories(self.plant, channel, self.certificate_contract)
-
-    @property
-    def limits_the_way(self) -> bool:
-        """Whether there are limits beyond those of states at samples: at all times, or of states and inputs."""
-        return self.plant.between_samples is not None or len(self.plant.mixed_rows) > 0
-
-    @property
-    def oldest(self) -> float:
-        """The largest age of the newest sample that the contract allows [steps]; infinite without one."""
-        return largest_age(self.contract)
 
 
 class LoopState(CopiedWhole, ABC):
@@ -200,7 +197,7 @@ class LoopState(CopiedWhole, ABC):
         """Returns what happened; the costs of loops that are not `counted`, shape (N,), do not count once more."""
         plant, estimator, worst = self.loop.plant, self.estimator, self.worst
         values = plant.constraint_values(self.state) if self.loop.limits_the_way else worst
-        estimate, number = estimator.numbered(self.pending)
+        estimate, number = estimator.numbered(self.downlink.committed.pending)
         age, damaged, outside = estimator.age, estimator.damaged, self.process.alarm
         alarm, asked, forced = estimator.alarm | outside, False, False
         if self.requests is not None:
@@ -220,7 +217,7 @@ class LoopState(CopiedWhole, ABC):
         belief = Belief(estimate, number, table, age, alarm, damaged, outside, applied, committed, self.moves)
         happened = belief, self.steps, self.state, estimator.mean, arrived, self.packets
         kept = values, worst, cost, self.violations
-        return Report(*happened, *kept, missing, asked, forced, self._others | self.process.infos)
+        return Report(*happened, *kept, missing, asked, forced, self._others)
 
     @property
     def pending(self) -> tuple[np.ndarray, ...]:
@@ -293,7 +290,7 @@ class OneLoop(LoopState):
         self.memory = self.process.begin(rng)
         for links in self.links.values():
             links.begin(rng)
-        self._others = channel_infos(self.channels, self.downlinks)
+        self._others = channel_infos(self.channels, self.downlinks) | self.process.infos
         channel = self.channels.now[0]
         self.network, self.packets = ChannelState(channel, rng), 0
         if self.requests is not None:
@@ -366,6 +363,7 @@ class ManyLoops(LoopState):
         channels, commands = self.channels.begin(rng, rows), self.downlinks.begin(rng, rows)
         if count == self.size or not (self.channels.is_plain and self.downlinks.is_plain):
             self._others = channel_infos(self.channels, self.downlinks, many=True)
+        self._others = self._others | self.process.infos
         if count == self.size:
             self.memory = np.array(memory)
             self.network = VectorChannelState(channels or loop.channel, rng, count)

@@ -1,9 +1,9 @@
-"""What is told of a control loop, or of N: what a controller can know, what happened, and who is told it inside."""
+"""What is told of a control loop, or of N: what a controller can know, and what happened."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -83,42 +83,6 @@ class Beginning(NamedTuple):
     start: Any
     earlier: list[tuple[np.ndarray, Any]]
     channels: Sequence[Channel]
-
-
-class Guard(Protocol):
-    """Decides the inputs of a loop, or of N, given what a controller can know, and reports on it.
-
-    A step is `input` and then `observe`, a start is `begin`; `info` and `charge` follow, `tell` comes last.
-    """
-
-    @property
-    def charge(self) -> Any:
-        """What is subtracted from the reward of the last step, a number or shape (N,)."""
-        ...
-
-    def begin(self, beginning: Beginning, mask: Any = None) -> None:
-        """Begins episodes, of N loops where `mask`, shape (N,), says so."""
-        ...
-
-    def input(self, u: np.ndarray) -> np.ndarray:
-        """Returns the input to apply in place of a proposed one, shape (m,) or (m, N)."""
-        ...
-
-    def observe(self, belief: Belief) -> None:
-        """Takes in what is known after the step."""
-        ...
-
-    def info(self) -> dict[str, Any]:
-        """Returns the guard's keys of `info`, fresh arrays."""
-        ...
-
-    def tell(self) -> None:
-        """Warns or raises, if there is a reason."""
-        ...
-
-    def annotation(self, loop: int = 0) -> Any:
-        """Returns what the picture of the last step shows of a loop."""
-        ...
 
 
 class Report(NamedTuple):

@@ -11,13 +11,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.autoreset import Autoreset, Begun, Moved
-from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv
+from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv, note_of
 from ncs_gym.envs.guarded_loop import GuardedLoop
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import ManyLoops, with_columns
 from ncs_gym.envs.loop_settings import CHANNELS, vector_reset_options
 from ncs_gym.envs.spaces import Observer, read_actions
-from ncs_gym.network.channel import Channel, require_on_request, widest
+from ncs_gym.network.channel import Channel, widest
 from ncs_gym.network.downlink import no_inputs
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.validation import as_count, setting, shown
@@ -99,11 +99,6 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         self._now = ManyLoops(single.loop, self.num_envs, *own)
 
     @property
-    def state(self) -> np.ndarray:
-        """The true states, shape (N, n), a copy; only `reset(options={"state": x})` sets them."""
-        return self._now.state.T.copy()
-
-    @property
     def episode_channels(self) -> tuple[Channel, ...]:
         """The channels of the present episodes."""
         return tuple(self._now.channels.now)
@@ -139,7 +134,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         super().reset(seed=seed)
         if seed is not None:
             self._now.process.forget()
-        self._draws_of_task(seed)
+        self._begin_draws_of_task(seed)
         chosen = np.flatnonzero(mask).tolist()
         sources = self._now.drawn(sources, self.np_random, chosen)
         if not (self._consistent or mask.all()):
@@ -151,7 +146,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         self._consistent = True
         self._draw(info, begins=mask, moved=False)
         if self._guard is not None:
-            self._guard.tell()
+            self._guard.lost.tell()
         return observation, info
 
     @np.errstate(all="ignore")
@@ -171,7 +166,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         self._consistent = True
         self._draw(moved[-1], begins=self._autoreset.begun)
         if self._guard is not None:
-            self._guard.tell()
+            self._guard.lost.tell()
         return moved
 
     def _move(self, u: np.ndarray) -> Moved:
@@ -180,13 +175,13 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         u = u if guard is None else guard.input(u)
         inputs, arrived = now.move(self.np_random, u)
         applied = inputs.applied
-        self._task_state = self._task.advance_many(self._draws_of_task(), self.plant, self._task_state, applied)
+        self._task_state = self._task.advance_many(self._task_random, self.plant, self._task_state, applied)
         reward = self._task.reward_many(self.plant, self._task_state, now.state, applied)
         info = self._info(inputs, arrived)
         if guard is not None:
             guard.observe(self._belief)
             info |= guard.info()
-            reward = reward - guard.charge
+            reward = reward - guard.penalty * info["shield_intervened"]
         terminated, truncated = np.zeros((2, self.num_envs), np.bool_)
         process = now.process.process
         if process.terminated is not False:  # other people's environments may end
@@ -204,30 +199,13 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         """
         now = self._now
         now.begin(self.np_random, mask, starts, fixed)
-        begun = self._task.begin_many(self._draws_of_task(), self.plant, int(np.count_nonzero(mask)))
+        begun = self._task.begin_many(self._task_random, self.plant, int(np.count_nonzero(mask)))
         self._task_state = np.array(begun) if mask.all() else with_columns(self._task_state, mask, begun)
         info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         if self._guard is not None:
             self._guard.begin(now.beginning(self._belief, np.flatnonzero(mask)), mask)
             info |= self._guard.info()
         return self._observation(), info
-
-    def request(self, asked: Any = True) -> None:
-        """Asks for samples in the next step, in all environments or where a mask (N,) says so; see `NCSEnv.request`.
-
-        Raises:
-            ValueError: If the channel does not take samples on request, or what is given is no bool.
-        """
-        require_on_request(self._now.requests).ask(asked)
-
-    @property
-    def outstanding(self) -> np.ndarray:
-        """What `NCSEnv.outstanding` is, shape (N,).
-
-        Raises:
-            ValueError: If the channel does not take samples on request.
-        """
-        return require_on_request(self._now.requests).outstanding(self._now.estimator.age)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns the picture of `rendered_env` for each environment (`RecordVideo(record_first_only=True)`).
@@ -245,9 +223,8 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         renderer, e = self._single.renderer, self.rendered_env
         if renderer is None:
             return
-        note = None if self._guard is None else self._guard.annotation(e)
         own = {key: value[e] for key, value in info.items() if not key.startswith(("_", "final"))}
-        task_state = np.copy(self._task_state[..., e])[()]
+        task_state, note = np.copy(self._task_state[..., e])[()], note_of(self._guard, own, e)
         if begins[e]:
             renderer.begin(own, task_state, note)
         elif moved:

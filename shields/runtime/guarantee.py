@@ -276,13 +276,8 @@ class LostGuarantee:
 
     def tell_of(self, reason: str) -> None:
         """Says why a single loop is not proved safe, unless the reason is empty or was given in this episode."""
-        if reason:
-            self.note_of(reason)
-            self.tell()
-
-    def note_of(self, reason: str) -> None:
-        """Takes in why a single loop is not proved safe."""
         self.note(CODES[reason])
+        self.tell()
 
 
 def _not(condition: Any) -> Any:

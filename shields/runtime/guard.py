@@ -14,7 +14,6 @@ from ncs_gym.envs.report import Beginning, Belief
 from ncs_gym.network.actuator import CommittedInputs
 from ncs_gym.network.contract import warn_of_broken_contract
 from ncs_gym.network.downlink import DownlinkProtocol
-from ncs_gym.rendering import Annotation
 from ncs_gym.validation import CopiedWhole
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
@@ -89,8 +88,9 @@ class Guard(CopiedWhole, ABC):
             same_input = _equal(belief.committed, decided)
         moved_once = (belief.moves == self._moves + 1) & (self._asked == 1)
         self._moves, self._asked = belief.moves, 0
-        self._drop(moved_once & same_input & on_time)
-        self._take(belief)
+        if (goes_on := moved_once & same_input & on_time) is not True:
+            self._drop(goes_on)
+        self.belief, self.errors = belief, self._errors_of.of(belief.table, belief.number)
         happened = self._decision, moved_once, same_input, belief, self.errors, on_time
         self._state = self._monitor.advance(self._state, *happened)
 
@@ -100,13 +100,6 @@ class Guard(CopiedWhole, ABC):
         for channel in present - self._channels:
             warn_of_broken_contract(self.filter.certificate.contract, channel, self.input_delay)
         self._channels = present
-
-    def tell(self) -> None:
-        """Says what is new; see `LostGuarantee`."""
-        self.lost.tell()
-
-    def _take(self, belief: Belief) -> None:
-        self.belief, self.errors = belief, self._errors_of.of(belief.table, belief.number)
 
     def _covered(
         self, state: MonitorState, earlier: Sequence[tuple[np.ndarray, Any]], insides: Sequence[Any]
@@ -158,7 +151,7 @@ class OneGuard(Guard):
             known: What is known of x_0 .. x_c (`starts_known`).
             earlier: Estimates of x_0 .. x_{c-1}, before the first decision takes effect, and numbers of their errors.
         """
-        self._take(belief)
+        self.belief, self.errors = belief, self._errors_of.of(belief.table, belief.number)
         self._moves, self._asked = belief.moves, 0
         self._stored, is_safe = first_store(self.filter, belief.estimate, self.errors, known[-1])
         self._state = self._monitor.start(is_safe, belief, self.errors)
@@ -172,7 +165,8 @@ class OneGuard(Guard):
 
     def decide(self, proposed: np.ndarray) -> Decision:
         """Returns the decision about a proposed input, shape (m,), at the belief observed last; never raises."""
-        decision = self.filter.decide(self.belief.estimate, self.errors, proposed, self._stored)
+        given = self.belief.estimate, self.errors, proposed, self._stored
+        decision = self.filter.decide_alone(*given) or self.filter.decide(*given)
         self._decision, self._proposed, self._asked = decision, proposed, self._asked + 1
         self._stored = decision.plan.copy() if len(decision.plan) else decision.plan
         return decision
@@ -183,44 +177,33 @@ class OneGuard(Guard):
         return decision.input if decision.intervened else u
 
     @property
-    def charge(self) -> float:
-        """The penalty of the last step."""
-        return self.penalty * self._decision.intervened
-
-    @property
-    def plan_length(self) -> int:
-        """Number of inputs stored for the steps to come."""
-        return len(self._stored)
-
-    @property
     def reason(self) -> str:
         """Why the state is not proved safe now; empty while it is."""
         return EXPLANATIONS[self._monitor.reasons(self._state, self.belief.age)]
 
     def info(self) -> dict[str, Any]:
         """Returns the keys of `info`, and counts: once after each `begin` or `observe`."""
-        decision, proposed, reason = self._decision, self._proposed, self.reason
+        decision, proposed, code = self._decision, self._proposed, self._monitor.reasons(self._state, self.belief.age)
         self._count += 1
-        self._proved += not reason
+        self._proved += not code
         self._interventions += decision.intervened
-        if reason:
-            self.lost.note_of(reason)
-        ahead = {"shield_plan_length": self.plan_length} if self.filter.mode == "lookahead" else {}
+        if code:
+            self.lost.note(code)
+        ahead = {"shield_plan_length": len(self._stored)} if self.filter.mode == "lookahead" else {}
         return ahead | {
             "shield_intervened": decision.intervened,
             "input_proposed": proposed.copy(),
             "shield_correction": hypot(*(decision.input - proposed).tolist()) if decision.intervened else 0.0,
             "shield_margin": decision.margin,
-            "shield_guaranteed": not reason,
-            "shield_reason": reason,
+            "shield_guaranteed": not code,
+            "shield_reason": EXPLANATIONS[code],
             "episode_interventions": self._interventions,
             "episode_guaranteed": self._proved / self._count,
         }
 
-    def annotation(self, loop: int = 0) -> Annotation:
-        """Returns what the picture of the last step shows."""
-        moved, acted = self._count > 1, self._decision.intervened
-        return _annotation(self.filter, self._proposed if moved else None, self._stored, acted, self._interventions)
+    def plan(self, loop: int = 0) -> np.ndarray:
+        """Returns the inputs stored for the steps to come, shape (k, m)."""
+        return self._stored.copy()
 
     def _drop(self, goes_on: bool) -> None:
         if not goes_on:
@@ -255,7 +238,7 @@ class ManyGuards(Guard):
         self._interventions, self._proved, self._count = np.zeros((3, size), np.int64)
         self._decision = Decision(self._idle, none, none, none, np.zeros(size), none)
         # Plans stored in mode "lookahead", NaN beyond their ends.
-        self._stored = np.full((safety_filter.lookahead.horizon, *self._idle.shape), np.nan)
+        self._stored = np.full((safety_filter.horizon or 0, *self._idle.shape), np.nan)
         self._no_reason = np.full(size, "", dtype=object)
         self._no_reason.flags.writeable = False
 
@@ -265,7 +248,7 @@ class ManyGuards(Guard):
         chosen, none = np.flatnonzero(mask), self._none
         self.look_at(channels)
         self.lost.begin(mask)
-        self._take(belief)
+        self.belief, self.errors = belief, self._errors_of.of(belief.table, belief.number)
         known = [self._drawn] * self._size
         for e in np.flatnonzero(mask & ~np.isnan(starts[:, 0])).tolist():
             known[e] = starts_known(self.filter, starts[e], self.input_delay)
@@ -307,11 +290,6 @@ class ManyGuards(Guard):
         self._stored, self._asked = decided.plan.copy(), self._asked + 1
         return decided.input
 
-    @property
-    def charge(self) -> np.ndarray:
-        """The penalties of the last step, shape (N,)."""
-        return self.penalty * self._decision.intervened
-
     def info(self) -> dict[str, Any]:
         """Returns the keys of `info`, and counts: once after each `begin` or `observe`."""
         decided, proposed = self._decision, self._proposed
@@ -336,12 +314,10 @@ class ManyGuards(Guard):
             "episode_guaranteed": self._proved / self._count,
         }
 
-    def annotation(self, loop: int = 0) -> Annotation:
-        """Returns what the picture of the last step shows of a loop."""
-        plan, acted = self._stored[..., loop], bool(self._decision.intervened[loop])
-        plan = plan[~np.isnan(plan[:, 0])] if len(plan) else plan
-        proposed = self._proposed[:, loop] if self._count[loop] > 1 else None
-        return _annotation(self.filter, proposed, plan, acted, int(self._interventions[loop]))
+    def plan(self, loop: int = 0) -> np.ndarray:
+        """Returns the inputs stored for the steps to come of a loop, shape (k, m)."""
+        plan = self._stored[..., loop]
+        return plan[~np.isnan(plan[:, 0])] if len(plan) else plan.copy()
 
     def _leave(self, strayed: np.ndarray) -> None:
         """Ends the proof of loops that moved without this guard."""
@@ -355,20 +331,6 @@ class ManyGuards(Guard):
     def _drop(self, goes_on: np.ndarray) -> None:
         if len(self._stored):
             self._stored[..., ~goes_on] = np.nan
-
-
-def _annotation(
-    safety_filter: SafetyFilter, proposed: np.ndarray | None, plan: np.ndarray, acted: bool, count: int
-) -> Annotation:
-    return Annotation(
-        safe_set=safety_filter.certificate.safe_set,
-        label=safety_filter.mode,
-        proposed=None if proposed is None else proposed.copy(),
-        intervened=acted,
-        interventions=count,
-        protects=safety_filter.mode != "monitor",
-        plan=plan.copy() if safety_filter.mode == "lookahead" else None,
-    )
 
 
 def _equal(taken: np.ndarray, decided: np.ndarray) -> Any:

@@ -15,7 +15,7 @@ from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.actuator import AppliedInputs, Command, CommittedInputs, Echo, as_echo
 from ncs_gym.network.channel import require_on_request
-from ncs_gym.network.contract import MAX_AGE, largest_age, warn_of_broken_contract
+from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.network.packet_reception import DiscardedPackets, UnusedPacketsWarning, as_packet
 from ncs_gym.network.requests import Requests
@@ -31,7 +31,6 @@ from ncs_gym.validation import (
     warn_caller,
 )
 from shields.certificate import Certificate
-from shields.certificate_text import contract_text, size_of, table
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
     LATE_INPUT,
@@ -75,12 +74,12 @@ class SafeLoop(CopiedWhole):
     `start`; a packet carries the number of the step at which its sample was taken, and that of the episode.
 
     The guarantee is that of `SafetyShield`, under the same assumptions (docs/shield.md): `guaranteed` says whether the
-    state is proved to be in the certificate's safe set S at this step, `reason` why not, `print(loop)` both. What the
-    loop cannot see is that the clock misses a step, that the actuator applies something else (unless it is told, or
-    hears `echoes`), or that packets carry wrong stamps. A certificate under a channel contract brings its error sets
-    along. Not for use by several threads at once. A loop can be pickled between two calls, and goes on from there
-    where it is loaded. Where `start`, `receive` or `decide` is interrupted, by whatever it may be, the loop is stopped
-    and nothing is proved until the next `start`.
+    state is proved to be in the certificate's safe set S at this step, `reason` why not. What the loop cannot see is
+    that the clock misses a step, that the actuator applies something else (unless it is told, or hears `echoes`), or
+    that packets carry wrong stamps. A certificate under a channel contract brings its error sets along. Not for use by
+    several threads at once. A loop can be pickled between two calls, and goes on from there where it is loaded. Where
+    `start`, `receive` or `decide` is interrupted, by whatever it may be, the loop is stopped and nothing is proved
+    until the next `start`.
 
     Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
     `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect
@@ -156,25 +155,6 @@ class SafeLoop(CopiedWhole):
         self._applied = AppliedInputs(self._echo_age)
         self._discarded, self._told_of = DiscardedPackets(), frozenset[str]()
         self._phase = _Phase.STOPPED
-
-    def __str__(self) -> str:
-        certificate, mode, horizon = self._filter.certificate, self._filter.mode, self._filter.horizon
-        fingerprint = f"of the plant with fingerprint {certificate.fingerprint[:16]}"
-        age = f"the newest sample is {counted(self.measurement_age, 'step')} old"
-        if self.measurement_age > largest_age(self._contract) - self._input_delay:
-            age += ", older than the contract allows"
-        proved = "the state stays in the box" if mode == "lookahead" else "the state is in S"
-        proved += "" if self._echo_age is not None else ", if everything that is decided is applied"
-        is_started, delay = self._phase is not _Phase.STOPPED, counted(self._input_delay, "step")
-        rows = [
-            ("mode", mode if horizon is None else f"{mode}, horizon {counted(horizon, 'step')}"),
-            ("certificate", ", ".join(filter(None, (fingerprint, size_of(certificate))))),
-            ("contract", contract_text(self._contract, self._input_delay)),
-            ("downlink", f"inputs take effect {delay} after the decision" if self._input_delay else ""),
-            ("step", f"{self.steps} of episode {self.episode}, {age}" if is_started else ""),
-            ("guaranteed", f"yes: {proved}" if self.guaranteed else f"no: {self.reason}"),
-        ]
-        return table("Safe loop: estimator, safety filter and monitor of the guarantee", rows)
 
     @np.errstate(all="ignore")
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
@@ -366,7 +346,7 @@ class SafeLoop(CopiedWhole):
     @property
     def plan_length(self) -> int:
         """Number of inputs stored for the steps after this decision; 0 in other modes than "lookahead"."""
-        return 0 if self._phase is _Phase.STOPPED else self._guard.plan_length
+        return 0 if self._phase is _Phase.STOPPED else len(self._guard.plan())
 
     @property
     def estimate(self) -> np.ndarray:

@@ -14,7 +14,6 @@ from ncs_gym.envs.spaces import expressible
 from ncs_gym.validation import ReadOnlyArrays, as_count, as_numbers, read_only, shown
 from shields.certificate import Certificate
 from shields.runtime.decisions import FALLBACK, INVALID, PLANNED, PROJECTED, REASONS, SAFE, UNSAFE, Decision
-from shields.runtime.no_plans import NoPlans
 from shields.runtime.set_test import (
     MOST_INPUTS_WITH_VERTICES,
     PredictedErrors,
@@ -60,7 +59,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     Attributes:
         test: The test of an input.
-        lookahead: What finds and certifies the plans of mode "lookahead"; in others `NoPlans`.
+        lookahead: What finds and certifies the plans of mode "lookahead"; None in others.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
@@ -73,7 +72,7 @@ class SafetyFilter(ReadOnlyArrays):
     mode: str = "project"
     horizon: int | None = None
     test: SetTest = field(init=False, repr=False)
-    lookahead: Lookahead | NoPlans = field(init=False, repr=False)
+    lookahead: Lookahead | None = field(init=False, repr=False)
     _no_plan: np.ndarray = field(init=False, repr=False)
     _constant: np.ndarray = field(init=False, repr=False)
     _low: np.ndarray = field(init=False, repr=False)
@@ -99,7 +98,7 @@ class SafetyFilter(ReadOnlyArrays):
             object.__setattr__(self, name, read_only(each[:, None]))
         object.__setattr__(self, "_remembered", {})
         object.__setattr__(self, "horizon", horizon)
-        object.__setattr__(self, "lookahead", NoPlans(self.plant.m))
+        object.__setattr__(self, "lookahead", None)
         if horizon is not None:
             from shields.runtime.backup_plans import Lookahead  # imported here: other modes need no solver
 
@@ -140,22 +139,26 @@ class SafetyFilter(ReadOnlyArrays):
                 pairs = (estimate, x_hat), (input_proposed, proposed)
                 one, other = (given if array.ndim else array[None] for given, array in pairs)
                 return self.decide(one, errors, other, stored)
-        elif self.mode != "boundary":
-            decision = self._decide_alone(x_hat, errors, proposed, stored)
-            if decision is not None:
-                return decision
+        elif (decision := self.decide_alone(x_hat, errors, proposed, stored)) is not None:
+            return decision
         n, m = self.plant.n, self.plant.m
-        plans = self.lookahead.as_stored(stored)[..., None]
-        decided = self.decide_columns(_as_column(x_hat, n), errors.batch(), _as_column(proposed, m), plans)
+        plans = self._no_plan if self.lookahead is None else self.lookahead.as_stored(stored)
+        decided = self.decide_columns(_as_column(x_hat, n), errors.batch(), _as_column(proposed, m), plans[..., None])
         one = Decision(*(array[..., 0].tolist() for array in decided))
         plan = decided.plan[..., 0]
         plan = plan[~np.isnan(plan[:, 0])] if len(plan) else self._no_plan
         return one._replace(input=np.array(one.input), reason=REASONS[one.reason], plan=plan)
 
-    def _decide_alone(
+    def decide_alone(
         self, estimate: np.ndarray, errors: PredictedErrors, proposed: np.ndarray, stored: Any
     ) -> Decision | None:
-        """Returns the decision in the common cases, in half the time: what passes, begins a plan, or is projected."""
+        """Returns the decision in the common cases, in half the time: what passes, begins a plan, or is projected.
+
+        Estimate, shape (n,), and proposal, (m,), are float64 arrays that nobody writes to; None in other cases.
+        """
+        if self.mode == "boundary":
+            return None
+        lookahead = self.lookahead
         for u, (low, high) in zip(proposed.tolist(), self.test.limits, strict=True):
             if not low <= u <= high:  # neither NaN
                 return None
@@ -164,7 +167,7 @@ class SafetyFilter(ReadOnlyArrays):
             return Decision(proposed, False, True, False, margin, REASONS[SAFE], self._no_plan)
         if isnan(test_margin):
             return None
-        plan = self.lookahead.beginning_alone(estimate, errors, proposed)
+        plan = None if lookahead is None else lookahead.beginning_alone(estimate, errors, proposed)
         if plan is not None:
             return Decision(plan[0], False, True, False, margin, REASONS[PLANNED], plan[1:])
         if self.mode not in ("project", "lookahead") or self.plant.m > 1:
@@ -172,8 +175,10 @@ class SafetyFilter(ReadOnlyArrays):
         closest = self.test.closest_alone(estimate, errors, proposed.item(), self.projection_margin)
         closest = self._expressible(np.array([closest]))
         test_margin, margin = self.test.margins_alone(estimate, errors, closest)
-        if not test_margin >= MARGIN or self.lookahead.may_do_better(estimate, errors, proposed, closest, stored):
-            return None  # also for NaN
+        if not test_margin >= MARGIN:  # also for NaN
+            return None
+        if lookahead is not None and lookahead.may_do_better(estimate, errors, proposed, closest, stored):
+            return None
         return Decision(closest, True, True, False, margin, REASONS[PROJECTED], self._no_plan)
 
     def decide_columns(
@@ -194,14 +199,16 @@ class SafetyFilter(ReadOnlyArrays):
         valid: np.ndarray = within[0] if len(within) == 1 else np.all(within, axis=0)
         passed = (judged >= MARGIN) & valid
         fallback, reason = np.zeros(len(passed), np.bool_), np.zeros(len(passed), np.int64)
-        plan = np.full((self.lookahead.horizon, *proposed.shape), np.nan)
+        plan = np.full((self.horizon or 0, *proposed.shape), np.nan)
         stored = plan.copy() if stored is None else stored
         decided = Decision(proposed.copy(), ~passed, passed, fallback, margin, reason, plan, np.zeros_like(fallback))
-        self.lookahead.keep(decided, valid, estimates, errors, stored)
+        if self.lookahead is not None:
+            self.lookahead.keep(decided, valid, estimates, errors, stored)
         if self.mode in ("project", "lookahead"):
             self._project(decided, np.flatnonzero(~decided.proved & valid), sets)
         self._fall_back(decided, np.flatnonzero(~decided.proved), sets, estimates, valid)
-        self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
+        if self.lookahead is not None:
+            self.lookahead.complete(decided, sets, estimates, errors, proposed, stored)
         return decided
 
     @np.errstate(all="ignore")
@@ -231,7 +238,7 @@ class SafetyFilter(ReadOnlyArrays):
         count = len(arrays["estimates"]) if arrays["estimates"].ndim == 2 else 0
         shapes = {"estimates": [(count, n)], "error_shapes": [(n, n), (count, n, n)], "proposals": [(count, m)]}
         if stored is not None:
-            arrays["stored"], shapes["stored"] = _as_array(stored), [(count, self.lookahead.horizon, m)]
+            arrays["stored"], shapes["stored"] = _as_array(stored), [(count, self.horizon or 0, m)]
         for name, array in arrays.items():
             if array.shape not in shapes[name]:
                 wanted = " or ".join(str(shape).replace(f"({count},", "(N,", 1) for shape in shapes[name])
@@ -241,7 +248,7 @@ class SafetyFilter(ReadOnlyArrays):
         errors = errors.of(np.zeros(count, np.intp)) if one_shape else errors
         columns = [np.array(arrays[name].T, order="C") for name in ("estimates", "proposals")]
         plans = None
-        if stored is not None:
+        if stored is not None and self.lookahead is not None:
             plans = self.lookahead.all_as_stored(arrays["stored"]).transpose(1, 2, 0).copy()
         decided = self.decide_columns(columns[0], errors, columns[1], plans)
         return decided._replace(
@@ -252,7 +259,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     def first_plan(self, estimate: np.ndarray, errors: PredictedErrors) -> np.ndarray:
         """Returns a certified plan that may be stored before the first decision, shape (k, m); empty without one."""
-        if not self.lookahead.horizon:
+        if self.lookahead is None:
             return self._no_plan
         first = self.decide(estimate, errors, self._gained(_as_column(estimate, self.plant.n))[:, 0])
         return np.concatenate([first.input[None], first.plan]) if first.proved else self._no_plan
@@ -280,7 +287,7 @@ class SafetyFilter(ReadOnlyArrays):
     def errors_of_many(self, error_shapes: np.ndarray) -> PredictedErrors:
         """Returns what is known of error shapes, (k, n, n); only mode "lookahead" needs the shapes themselves."""
         known = self.test.predicted(error_shapes, self.certificate.error_shapes)
-        return known if self.lookahead.needs_shapes else known._replace(shape=known.shape[:0])
+        return known if self.lookahead is not None else known._replace(shape=known.shape[:0])
 
     def margin(self, estimate: np.ndarray, error_shape: np.ndarray | PredictedErrors, u: np.ndarray) -> float:
         """Returns the margin of an input u, shape (m,), as `Decision` defines it; NaN if any argument is unusable."""

@@ -121,7 +121,7 @@ def starts_known(
         center, shape = _moved(plant, center, shape)
         errors = safety_filter.errors_of(shape)
         inside = bool(safety_filter.test.knows_inside(center, errors, MARGIN))
-        known.append(StartKnown(inside, inside or safety_filter.lookahead.knows_in_box(center, errors)))
+        known.append(StartKnown(inside, inside or _knows_in_box(safety_filter, center, errors)))
     return tuple(known)
 
 
@@ -135,7 +135,7 @@ def known_inside(safety_filter: SafetyFilter, known: StartKnown, estimate: np.nd
     if not safety_filter.test.keeps_within_step(estimate, errors, MARGIN):
         return False
     inside = bool(safety_filter.test.knows_inside(estimate, errors, MARGIN))
-    return inside or safety_filter.lookahead.knows_in_box(estimate, errors)
+    return inside or _knows_in_box(safety_filter, estimate, errors)
 
 
 def first_store(
@@ -147,13 +147,18 @@ def first_store(
     is known to be in the safe set; in mode "lookahead" also where it is known to be in the box, by what starts are
     possible or by the estimate, shape (n,), and a first plan is certified.
     """
-    lookahead = safety_filter.lookahead
     inside = known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN)
     if inside:
         return np.empty((0, safety_filter.plant.m)), known.in_safe_set
     plan = safety_filter.first_plan(estimate, errors)
-    in_box = len(plan) > 0 and (known.in_box or lookahead.knows_in_box(estimate, errors))
+    in_box = len(plan) > 0 and (known.in_box or _knows_in_box(safety_filter, estimate, errors))
     return plan, in_box
+
+
+def _knows_in_box(safety_filter: SafetyFilter, estimate: np.ndarray, errors: PredictedErrors) -> bool:
+    """Returns whether an estimate, shape (n,), proves that x is in the box; without plans that proves nothing."""
+    lookahead = safety_filter.lookahead
+    return lookahead is not None and lookahead.knows_in_box(estimate, errors)
 
 
 def _moved(plant: LinearPlant, center: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -34,11 +34,8 @@ class Lookahead:
 
     Attributes:
         horizon: Longest plan, in steps.
-        needs_shapes: Whether plans need the error shapes themselves.
         planner: Finds the plans.
     """
-
-    needs_shapes = True
 
     def __init__(self, test: SetTest, fallback: Fallback, horizon: int, margin: float) -> None:
         self._test, self.horizon, self._margin = test, horizon, margin

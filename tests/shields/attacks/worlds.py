@@ -171,7 +171,7 @@ class SeenEnv(NCSEnv):
         def overheard(u):
             applied = decide(u)
             if (adversary := self.disturbance.adversary) is not None and guard.filter.mode == "lookahead":
-                adversary.plan = guard.annotation().plan
+                adversary.plan = guard.plan()
             return applied
 
         guard.input = overheard

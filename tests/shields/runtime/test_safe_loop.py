@@ -1,6 +1,5 @@
 """The loop without Gymnasium: the same decisions and proofs as the wrapper's."""
 
-import re
 from contextlib import nullcontext
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truck_trailer
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from shields.runtime.guarantee import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OTHER_INPUT
-from shields.runtime.safe_loop import NOT_STARTED
 from tests.certificates import certificate_of
 from tests.product import safe_loop
 
@@ -199,32 +197,3 @@ def test_sample_that_is_sent_after_a_decision_and_received_at_the_next_step_is_o
             arrived = [Packet(step, np.zeros(2), loop.episode)]
     assert loop.discarded.too_late == late
     assert loop.measurement_age == (20 if late else 1)
-
-
-def text_of(loop):
-    """The rows that a loop prints, by name."""
-    title, *lines = str(loop).splitlines()
-    assert title.startswith("Safe loop")
-    rows = re.findall(r"(?m)^  (\S+) +(.*(?:\n {14}.*)*)", "\n".join(lines))
-    return {name: " ".join(text.split()) for name, text in rows}
-
-
-def test_printed_loop_says_whether_the_state_is_proved_to_be_safe_and_why_not():
-    loop = loop_of("cart-pole", "switch")
-    text = text_of(loop)
-    assert text["mode"] == "switch"
-    assert loop.filter.certificate.fingerprint[:16] in text["certificate"]
-    assert "older than 4 steps" in text["contract"]
-    assert text["guaranteed"] == f"no: {NOT_STARTED}"
-    assert {"step", "downlink"} & set(text) == set()
-    loop.start(np.zeros(4))
-    loop.step(0.0)
-    loop.receive([Packet(1, np.zeros(4))])
-    text = text_of(loop)
-    assert text["step"] == "1 of episode 0, the newest sample is 0 steps old"
-    assert text["guaranteed"] == "yes: the state is in S, if everything that is decided is applied"
-    loop.decide(0.0)
-    loop.receive(applied=[3.0])
-    text = text_of(loop)
-    assert text["step"] == "2 of episode 0, the newest sample is 1 step old"
-    assert text["guaranteed"] == f"no: {OTHER_INPUT}" == f"no: {loop.reason}"
