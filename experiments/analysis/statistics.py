@@ -62,31 +62,3 @@ def bootstrap_interval(values: Values, statistic: Callable[..., float] = np.mean
         rng=np.random.default_rng(0),
     ).confidence_interval
     return [float(found.low), float(found.high)]
-
-
-def hierarchical_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> list[float] | None:
-    """Returns the percentile bootstrap's interval of the mean of what runs and their episodes gave.
-
-    Runs are resampled, then episodes within each resampled run, so that the interval covers what retraining changes
-    and what chance does in an evaluation. With a handful of runs it is too narrow, as every bootstrap is.
-
-    Args:
-        values: Shape (runs, episodes).
-        confidence: Of the interval.
-
-    Returns:
-        The interval; None for a single run.
-    """
-    runs, episodes = values.shape
-    if runs < 2:
-        return None
-    rng, means = np.random.default_rng(0), []
-    while len(means) * _BATCH < RESAMPLES:
-        chosen = rng.integers(runs, size=(_BATCH, runs))
-        if episodes == 1:
-            means.append(values[chosen, 0].mean(axis=1))
-        else:
-            within = rng.integers(episodes, size=(_BATCH, runs, episodes), dtype=np.int32)
-            means.append(values[chosen[..., None], within].mean(axis=(1, 2)))
-    tails = (0.5 - confidence / 2.0, 0.5 + confidence / 2.0)
-    return [float(end) for end in np.quantile(np.concatenate(means), tails)]

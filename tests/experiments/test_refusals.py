@@ -47,7 +47,7 @@ SETTINGS = [
 ]  # fmt: skip
 
 ARMS = ["", "shield", "shielded:", "shielded:hope", "monitor+penalty", "shielded:monitor", "penalized:", "penalized:-1"]
-ARMS += ["penalized:nan", "penalized:inf", "penalized+penalty", "lagrangian:1", "trusting:project", "psf:switch"]
+ARMS += ["penalized:nan", "penalized:inf", "penalized+penalty", "lagrangian:x", "trusting:project", "psf:switch"]
 ARMS += ["unshielded at test", "at test", "trusting+psf", "unshielded+shielded", "lqr+", "lqr+penalty"]
 ARMS += ["lqr+monitored", "shielded+residual", "+shielded", "K x_hat+K x_hat", "governor", "trusting:7", "mpc:tube"]
 

@@ -5,7 +5,6 @@ from scipy.stats import binom, norm
 from experiments.analysis.statistics import (
     bootstrap_interval,
     clopper_pearson,
-    hierarchical_interval,
     interquartile_mean,
     mean_interval,
 )
@@ -76,15 +75,3 @@ def test_hierarchical_interval_covers_what_retraining_changes_and_one_over_episo
         too_narrow.append(low <= 0.0 <= high)
     assert np.mean(covered) == pytest.approx(0.9, abs=0.06)  # of 12 runs, as for any bootstrap
     assert np.mean(too_narrow) < 0.7
-
-
-def test_hierarchical_interval_is_the_ordinary_bootstrap_where_a_run_has_one_episode():
-    values = np.random.default_rng(0).exponential(size=(60, 1))
-    assert hierarchical_interval(values) == pytest.approx(bootstrap_interval(values.ravel()), abs=0.02)
-    low, high = hierarchical_interval(values, 0.99)
-    assert low < hierarchical_interval(values)[0] < hierarchical_interval(values)[1] < high
-
-
-def test_hierarchical_interval_needs_two_runs():
-    assert hierarchical_interval(np.ones((1, 50))) is None
-    assert hierarchical_interval(np.ones((2, 3))) == [1.0, 1.0]
