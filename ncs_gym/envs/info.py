@@ -53,8 +53,6 @@ def loop_info(report: Report, loop: Loop, actions: tuple[np.ndarray, np.ndarray]
         info["input_committed"], info["downlink_broken"] = belief.committed.copy().T, report.missing
     if loop.channel.on_request:
         info["requested"], info["request_forced"] = report.requested, report.forced
-    if "parameters" in info:
-        info["parameters"] = info["parameters"].copy()
     if state.ndim > 1:
         for key in (*SHARED, *report.others):
             if key in info:

@@ -217,7 +217,7 @@ class LoopState(CopiedWhole, ABC):
         belief = Belief(estimate, number, table, age, alarm, damaged, outside, applied, committed, self.moves)
         happened = belief, self.steps, self.state, estimator.mean, arrived, self.packets
         kept = values, worst, cost, self.violations
-        return Report(*happened, *kept, missing, asked, forced, self._others)
+        return Report(*happened, *kept, missing, asked, forced, self._others | self.process.infos)
 
     @property
     def pending(self) -> tuple[np.ndarray, ...]:
@@ -290,7 +290,7 @@ class OneLoop(LoopState):
         self.memory = self.process.begin(rng)
         for links in self.links.values():
             links.begin(rng)
-        self._others = channel_infos(self.channels, self.downlinks) | self.process.infos
+        self._others = channel_infos(self.channels, self.downlinks)
         channel = self.channels.now[0]
         self.network, self.packets = ChannelState(channel, rng), 0
         if self.requests is not None:
@@ -363,7 +363,6 @@ class ManyLoops(LoopState):
         channels, commands = self.channels.begin(rng, rows), self.downlinks.begin(rng, rows)
         if count == self.size or not (self.channels.is_plain and self.downlinks.is_plain):
             self._others = channel_infos(self.channels, self.downlinks, many=True)
-        self._others = self._others | self.process.infos
         if count == self.size:
             self.memory = np.array(memory)
             self.network = VectorChannelState(channels or loop.channel, rng, count)
