@@ -64,14 +64,3 @@ def test_interquartile_mean_is_that_of_the_middle_half():
 
 
 @pytest.mark.slow
-def test_hierarchical_interval_covers_what_retraining_changes_and_one_over_episodes_does_not():
-    rng, covered, too_narrow = np.random.default_rng(0), [], []
-    for _ in range(150):
-        runs = rng.normal(0.0, 1.0, (12, 1))
-        values = runs + rng.normal(0.0, 1.0, (12, 20))
-        low, high = hierarchical_interval(values)
-        covered.append(low <= 0.0 <= high)
-        low, high = bootstrap_interval(values.ravel())
-        too_narrow.append(low <= 0.0 <= high)
-    assert np.mean(covered) == pytest.approx(0.9, abs=0.06)  # of 12 runs, as for any bootstrap
-    assert np.mean(too_narrow) < 0.7
