@@ -61,6 +61,3 @@ def test_interquartile_mean_is_that_of_the_middle_half():
     assert interquartile_mean([100.0, 1.0, 2.0, -50.0]) == 1.5
     assert interquartile_mean([1.0, 2.0, 3.0]) == 2.0
     np.testing.assert_array_equal(interquartile_mean([[0.0, 1.0, 3.0, 9.0], [1.0] * 4], axis=1), [2.0, 1.0])
-
-
-@pytest.mark.slow
