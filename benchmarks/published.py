@@ -60,7 +60,7 @@ def plant_of(name: str) -> LinearPlant:
     made = Model.sampled if is_continuous else Model
     disturbance = Through(E, Box(p["disturbance_low"], p["disturbance_high"]))
     return LinearPlant(
-        made(A, p["B"], p["C"], dt, (state, p["operating_input"])),
+        made(A, p["B"], p["C"], dt, (state, p["operating_input"])).with_delays(p.get("input_delays")),
         Limits((low, high), (p["input_low"], p["input_high"]), outputs),
         Bounds(disturbance, sensor=p["sensor_half_widths"], first_error=p["first_error_half_widths"]),
     )

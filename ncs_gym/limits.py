@@ -264,8 +264,8 @@ class Limits(ReadOnlyArrays):
             return given
         if any(model.is_given):
             raise ValueError(
-                f"{name} limits are absolute beside at= of a Model: give a pair (low, high) in place of half-widths, "
-                f"got {shown(given)}"
+                f"{name} limits are absolute beside at= of a Model: give a pair (low, high) of vectors in place of "
+                f"half-widths, got {shown(given)}"
             )
         fits = (widths > SMALLEST_NUMBER) & (widths < LARGEST_NUMBER) | (widths == np.inf)
         if not fits.all() or not np.isfinite(widths).any():

@@ -196,7 +196,11 @@ def bounds_from_recording(
     u, y = as_matrix(inputs, (None, m), "inputs") - model.input, as_matrix(outputs, (None, p), "outputs")
     if len(y) - len(u) not in (0, 1):
         raise ValueError(f"outputs must have as many rows as inputs, or one more, got {len(y):,} and {len(u):,}")
-    y, u = (y - H @ model.state)[model.delays :], u[: max(len(y) - 1 - model.delays, 0)]
+    u, late = u[: len(y) - 1], int(model.delays.max())
+    taken = [u[late - each : max(len(u) - each, 0)] for each in range(late + 1)]  # by the steps that they are late
+    pushed = sum(each @ np.where(model.delays == d, model.B, 0.0).T for d, each in enumerate(taken))
+    u = np.column_stack([taken[d][:, j] for j, d in enumerate(model.delays.max(axis=0).tolist())])
+    y = (y - H @ model.state)[late:]
     is_identity, E = E is None, np.eye(n) if E is None else as_matrix(E, (n, None), "E")
     if not np.abs(E).max(axis=0).all():
         raise ValueError("every direction of E must move a state, one is zero")
@@ -206,7 +210,7 @@ def bounds_from_recording(
     names = {"states": [f"x{i + 1}" for i in range(n)], "inputs": [f"u{i + 1}" for i in range(m)]}
     for each, default in names.items():
         names[each] = [*as_names([*(labels or {}).get(each, ())], tuple(default), f"names of {each}")]
-    record = _Record(model, E, u, y)
+    record = _Record(model, E, u, pushed, y)
     phi = np.broadcast_to(known, p).copy()
     explaining = record.explaining(phi, weights)
     upper, found, noise = record.upper(phi)
@@ -254,14 +258,15 @@ class _Record:
 
     Attributes:
         u, y: Deviations, shapes (N, m) and (N + 1, p).
+        pushed: What inputs add to each step, shape (N, n).
         index: Observability index nu.
         window: Number of steps of the windows that tell one disturbance, in their middle.
         read: Left inverse of O of nu samples, shape (n, nu p).
         y_unit, s_unit: Sizes of noise and of disturbances that explain the record alone, shapes (p,) and (q,).
     """
 
-    def __init__(self, model: Model, E: np.ndarray, u: np.ndarray, y: np.ndarray):
-        self.model, self.E, self.u, self.y, n, p = model, E, u, y, len(model.A), len(model.H)
+    def __init__(self, model: Model, E: np.ndarray, u: np.ndarray, pushed: Any, y: np.ndarray):
+        self.model, self.E, self.u, self.pushed, self.y, n, p = model, E, u, pushed, y, len(model.A), len(model.H)
         self.index = nu = next((each for each in range(1, n + 1) if _rank(self.of_state(each - 1)) == n), 0)
         if not nu:
             raise ValueError("the model is not observable: its outputs never tell all states, measure another one")
@@ -296,7 +301,7 @@ class _Record:
         count = len(self.u) - steps + 1
         seen, moved = [self.y[:count]], np.zeros((count, len(self.E)))
         for j in range(steps):
-            moved = moved @ self.model.A.T + self.u[j : j + count] @ self.model.B.T
+            moved = moved @ self.model.A.T + self.pushed[j : j + count]
             seen.append(self.y[j + 1 : j + 1 + count] - moved @ self.model.H.T)
         return np.hstack(seen)
 

@@ -11,35 +11,39 @@ from ncs_gym.limits import Deviations, Rows
 STORED_INPUT_REACH = 4.0
 
 
-def with_past_inputs(own: Deviations, delay: int, half: np.ndarray, change: np.ndarray | None) -> Deviations:
+def with_past_inputs(own: Deviations, delays: np.ndarray, half: np.ndarray, change: np.ndarray | None) -> Deviations:
     """Returns the plant with the inputs that it has to remember as further states: x, u_{k-d}, .., u_{k-1}.
 
     Args:
         own: The plant of its own states.
-        delay: d, the steps after which an input takes effect.
+        delays: Steps after which each input acts on each state, shape (n, m); d is the largest.
         half: Half the range of the inputs, shape (m,).
         change: Largest change of each input from one step to the next, shape (m,); None for any.
+
+    Raises:
+        ValueError: If limits of states and inputs together do not say which of several past inputs they mean.
     """
-    n, m = own.B.shape
-    stored = m * (delay or int(change is not None))
+    (n, m), d = own.B.shape, int(delays.max())
+    stored = m * (d or int(change is not None))
     if not stored:
         return own
     A, B = np.zeros((n + stored, n + stored)), np.zeros((n + stored, m))
-    A[:n, :n], A[n:-m, n + m :] = own.A, np.eye(stored - m)
-    if delay:
-        A[:n, n : n + m] = own.B
-    else:
-        B[:n] = own.B
-    B[-m:] = np.eye(m)
+    A[:n, :n], A[n:-m, n + m :], B[-m:] = own.A, np.eye(stored - m), np.eye(m)
+    B[:n] = np.where(delays == 0, own.B, 0.0)
+    for steps in range(1, d + 1):
+        A[:n, n + stored - m * steps :][:, :m] = np.where(delays == steps, own.B, 0.0)
     past = np.hstack([np.zeros((stored, n)), np.diag(np.tile(1.0 / (STORED_INPUT_REACH * half), stored // m))])
     box = [Rows(np.pad(own.box.rows, ((0, 0), (0, stored))), *own.box[1:])]
     box += [Rows(past, *np.tile(own.inputs / half, stored // m))]
     # An input that takes effect later is in the limits of states and inputs when it does, and a state by then.
     of_state, of_input = own.mixed.rows[:, :n], own.mixed.rows[:, n:]
-    others = np.zeros((len(of_state), stored + (0 if delay else m)))
-    others[:, slice(m) if delay else slice(stored, None)] = of_input
-    coupled, mixed = Rows(np.hstack([of_state, others]), *own.mixed[1:]), []
-    (box if delay else mixed).append(coupled)
+    if len(of_state) and np.ptp(delays, axis=0).any():
+        raise ValueError("limits of states and inputs together need one delay per input, not one per state and input")
+    others = np.zeros((len(of_state), stored + m))
+    others[:, stored - m * delays[0] + np.arange(m)] = of_input
+    is_now, coupled = others[:, stored:].any(axis=1), [np.hstack([of_state, others]), *own.mixed[1:]]
+    mixed = [Rows(*(each[is_now] for each in coupled))]
+    box.append(Rows(*(each[~is_now] for each in (coupled[0][:, : n + stored], *coupled[1:]))))
     if change is not None:
         rates = np.hstack([np.zeros((m, n + stored - m)), -np.eye(m), np.eye(m)]) / change[:, None]
         mixed.append(Rows(rates, -np.ones(m), np.ones(m)))

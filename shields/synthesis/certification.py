@@ -121,6 +121,10 @@ def _found(
         if rest is not None or needs_resting_point(plant):
             alone = around_resting_point(plant, contract, search, rest)
             return alone.certificate or infeasibility(plant, alone.tolerated, polytope=True, reason=alone.reason)
+        if polytope and 2 * plant.past > plant.n:  # an ellipsoid of mostly past inputs takes minutes, and adds nothing
+            alone = around_resting_point(plant, contract, search, at_operating_point(plant))
+            if alone.certificate is not None:
+                return alone.certificate
         ellipsoid = largest_ellipsoid(plant, contract, search, start, alternations)
         found, known = ellipsoid.certificate, [] if ellipsoid.K is None else [ellipsoid.K]
         tolerated, reason = None, ""

@@ -162,6 +162,18 @@ def test_records_are_in_the_units_of_the_model_and_inputs_act_after_its_delays()
     assert moved.lower == pytest.approx(found.lower, rel=1e-4)
 
 
+def test_records_are_read_with_the_delay_of_each_channel():
+    rng, E, half = np.random.default_rng(3), np.eye(2), np.array([0.01, 0.02])
+    model = Model([[0.9, 0.1], [0.0, 0.8]], [[1.0, 0.5], [0.2, 1.0]], None, 0.1).with_delays([[3, 0], [1, 2]])
+    u, x, acted = rng.normal(size=(200, 2)), [np.zeros(2)], rng.uniform(-half, half, (200, 2))
+    for k in range(200):
+        late = [[u[k - s, j] if k >= s else 0.0 for j, s in enumerate(row)] for row in model.delays]
+        x.append(model.A @ x[-1] + (model.B * late).sum(axis=1) + acted[k])
+    found = bounds_from_recording(model, u, x, E, sensor=1e-9)
+    assert found.steps == 197
+    assert found.upper == pytest.approx(np.abs(acted[3:]).max(axis=0), rel=1e-5)
+
+
 def test_last_input_is_left_out_where_no_output_follows_it():
     u, y, _ = driven(servo(), 60, 0.01, 1e-4)
     E = [[0.0], [1.0]]
