@@ -215,17 +215,10 @@ def _square(A: Any) -> np.ndarray:
 
 def _steps(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Returns whole steps of the given shape; raises ValueError if they are none."""
-    steps = as_setting(value)
-    if (
-        steps is None
-        or steps.shape not in ((), shape[-1:], shape)
-        or not ((steps >= 0) & (steps <= LONGEST_DELAY) & (steps == np.rint(steps))).all()
-    ):
-        shapes = " or ".join(str(each) for each in dict.fromkeys((shape[-1:], shape)))
-        raise ValueError(
-            f"{name} must be a whole number of steps from 0 to {LONGEST_DELAY}, or such numbers of shape {shapes}, got "
-            f"{shown(value)}"
-        )
+    steps, shapes = as_setting(value), [*dict.fromkeys((shape[-1:], shape))]
+    if steps is None or steps.shape not in ((), *shapes) or not np.isin(steps, np.arange(LONGEST_DELAY + 1)).all():
+        one = f"{name} must be a whole number of steps from 0 to {LONGEST_DELAY}"
+        raise ValueError(f"{one}, or such numbers of shape {' or '.join(map(str, shapes))}, got {shown(value)}")
     return np.broadcast_to(steps, shape).astype(int)
 
 

@@ -11,6 +11,20 @@ from ncs_gym.limits import Deviations, Rows
 STORED_INPUT_REACH = 4.0
 
 
+def acting(delays: np.ndarray, past: int) -> np.ndarray:
+    """Returns where among past and then present inputs those are that act now, shape (m,), by delays of shape (n, m).
+
+    Raises:
+        ValueError: If an input acts on several states with several delays.
+    """
+    if np.ptp(delays, axis=0).any():
+        raise ValueError(
+            "another process, or a limit of states and inputs together, needs one delay per input, as in "
+            "Model.with_delays([2, 0]), not one per state and input"
+        )
+    return past - delays.shape[1] * delays[0] + np.arange(delays.shape[1])
+
+
 def with_past_inputs(own: Deviations, delays: np.ndarray, half: np.ndarray, change: np.ndarray | None) -> Deviations:
     """Returns the plant with the inputs that it has to remember as further states: x, u_{k-d}, .., u_{k-1}.
 
@@ -37,10 +51,9 @@ def with_past_inputs(own: Deviations, delays: np.ndarray, half: np.ndarray, chan
     box += [Rows(past, *np.tile(own.inputs / half, stored // m))]
     # An input that takes effect later is in the limits of states and inputs when it does, and a state by then.
     of_state, of_input = own.mixed.rows[:, :n], own.mixed.rows[:, n:]
-    if len(of_state) and np.ptp(delays, axis=0).any():
-        raise ValueError("limits of states and inputs together need one delay per input, not one per state and input")
     others = np.zeros((len(of_state), stored + m))
-    others[:, stored - m * delays[0] + np.arange(m)] = of_input
+    if len(others):
+        others[:, acting(delays, stored)] = of_input
     is_now, coupled = others[:, stored:].any(axis=1), [np.hstack([of_state, others]), *own.mixed[1:]]
     mixed = [Rows(*(each[is_now] for each in coupled))]
     box.append(Rows(*(each[~is_now] for each in (coupled[0][:, : n + stored], *coupled[1:]))))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import time
 from dataclasses import replace
 
@@ -110,7 +109,6 @@ def test_outputs_that_do_not_tell_a_direction_leave_no_upper_bound_of_it():
     assert (found.lower <= np.abs(s).max(axis=0)).all()
     assert np.isinf(found.upper).all()
     assert " none " in str(found)
-    assert json.loads(json.dumps(found.document))["upper"] == [None, None]
     with pytest.raises(ValueError, match="these outputs leave no upper bound of x1: measure more"):
         found.bounds(2.0)
     with pytest.raises(ValueError, match="does not tell the state: give first_error"):
@@ -131,7 +129,8 @@ def test_disturbances_that_grow_with_the_input_accuse_the_model(sizes, mismatch)
     model = servo(np.eye(2))
     u, y, _ = driven(model, 500, np.array([0.0, 0.01]), 1e-5, sizes=sizes, mismatch=mismatch, swing=100.0)
     found = bounds_from_recording(model, u, y, sensor=1e-5)
-    assert [(each.direction, each.signal) for each in found.grows if each.direction == "x2"] == [("x2", "u1")]
+    (said,) = (each for each in found.grows if "disturbance x2" in each)
+    assert said.startswith("The disturbance x2 grows with |u1|, by ")
     assert "mend the model, since no bound of this record holds" in " ".join(str(found).split())
 
 
@@ -146,8 +145,7 @@ def test_share_and_longest_run_of_the_second_half_beyond_the_first_are_those_tha
     beyond = np.abs(s[200:]) > np.abs(s[:200]).max(axis=0)
     assert found.left == pytest.approx(beyond.mean(axis=0))
     assert found.left[0] >= 8 / 200
-    assert found.longest[0] == 7
-    assert "7 steps in a row, may exceed" in " ".join(str(found).split())
+    assert f"up to {100.0 * found.left.max():.3g} % of the second half's steps may" in " ".join(str(found).split())
 
 
 def test_records_are_in_the_units_of_the_model_and_inputs_act_after_its_delays():
