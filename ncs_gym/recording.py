@@ -111,11 +111,8 @@ class RecordedBounds(ReadOnlyArrays):
                 f"{name:<{width}}  {self.lower[i]:8.3g}  {self.explaining[i]:10.3g}  {most:>8}  "
                 f"{100.0 * self.left[i]:8.3g}"
             )
-        return "\n".join([*lines, *(fill(each, 80) for each in self._sentences())])
-
-    def _sentences(self) -> tuple[str, ...]:
         ends = f", unless one did within {counted(self.window, 'step')} of its ends" if self.window > 1 else ""
-        return (
+        sentences = (
             'If the model is right, this record proves that disturbances as large as "at least" occurred, and none '
             f'beyond "at most"{ends}.',
             "It does not prove that none larger will occur: up to "
@@ -124,6 +121,7 @@ class RecordedBounds(ReadOnlyArrays):
             "the same one do not.",
             *self.grows,
         )
+        return "\n".join([*lines, *(fill(each, 80) for each in sentences)])
 
 
 def bounds_from_recording(
