@@ -1,12 +1,15 @@
 """What certificates keep of plants that people published: `python -m benchmarks.published COMMAND`.
 
-Commands: shares, attack, impossible.
+Commands: shares, attack, impossible, board.
 """
 
 from __future__ import annotations
 
+import ctypes
 import json
 import math
+import subprocess
+import tempfile
 import time
 from collections import Counter
 from fractions import Fraction
@@ -25,6 +28,8 @@ from ncs_gym import Bounds, Box, Channel, ChannelContract, Ellipsoid, Limits, Li
 from ncs_gym.model import zero_order_hold
 from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, Infeasible, VectorSafetyShield, reach_of, synthesize, verify
+from shields.export import BoardTable, export_c
+from shields.export.board_filter import GUARANTEED
 from shields.synthesis.invariant_polytope import points_of_box
 
 # From so many points, a power of two, inputs are sought that keep the limits for so many steps.
@@ -32,6 +37,13 @@ _POINTS_LOG2, _STEPS = 9, 60
 # After so many samples errors that are hidden in noise are sought.
 _CYCLES = (1, 2, 4, 8, 16, 32)
 _SIDES = {"low": -np.inf, "high": np.inf}
+# Plants whose filters are attacked in C: limits of two ends, free states, unstable ones, outputs and registers.
+_ON_BOARDS = (
+    *("ctms_cruise", "fbs_cruise", "ctms_motor_pos", "quad_tank_min", "lane_keeping", "acc_mathworks"),
+    *("cstr_pcgym", "ampyc_sf", "boost", "bicycle", "heat_exchanger"),
+)
+# An episode of such an attack takes so many steps; another row of the safe set is aimed at every so many.
+_EPISODE, _PATIENCE = 250, 25
 Names = tyro.conf.Positional[tuple[str, ...]]
 
 
@@ -66,7 +78,7 @@ def plant_of(name: str) -> LinearPlant:
     disturbance = Through(E, Box(p["disturbance_low"], p["disturbance_high"]))
     first, axes = p["first_error_half_widths"], p.get("first_error_half_axes")
     return LinearPlant(
-        made(A, p["B"], p["C"], dt, (state, p["operating_input"])),
+        made(A, p["B"], p["C"], dt, (state, p["operating_input"])).with_delays(p.get("input_delays")),
         Limits((low, high), (p["input_low"], p["input_high"]), outputs),
         Bounds(disturbance, p["sensor_half_widths"], first if axes is None else Ellipsoid(np.diag(np.square(axes)))),
     )
@@ -200,6 +212,71 @@ def _errors(values: Any, numbers: np.ndarray, period: int) -> tuple[np.ndarray, 
     return error, np.concatenate(shown)
 
 
+def board(names: Names = _ON_BOARDS, steps: int = 20_000) -> None:
+    """Exports the filter of each plant to C, checks its test vectors, and attacks what was compiled (cc, make).
+
+    Noise of full size hides how near a row of the safe set is, disturbances push over it, proposals are extreme, and
+    samples are as old as the contract allows, or mixed. What counts is outside while the filter says "guaranteed".
+    """
+    show, total = table("plant", "states", "guaranteed", "outside", "farthest", first=18, width=11), Counter[str]()
+    for name in names:
+        plant = plant_of(name)
+        certificate = certified(name, plant)
+        with tempfile.TemporaryDirectory() as folder:
+            numbers = export_c(certificate, plant, Path(folder))
+            subprocess.run(["make", "-C", folder], check=True, capture_output=True)
+            subprocess.run(["cc", "-O2", "-shared", "-fPIC", "ncs_filter.c", "-o", "f.so"], cwd=folder, check=True)
+            compiled = ctypes.CDLL(f"{folder}/f.so")
+            guaranteed, outside, farthest = _attacked_board(compiled, numbers, plant, certificate, steps)
+        total += Counter(outside=outside, steps=guaranteed)
+        show(name, plant.n, f"{guaranteed:,}", outside, f"{farthest:.4f}")
+    print(f"{total['outside']} of {total['steps']:,} guaranteed steps left a set or broke a limit")
+
+
+def _attacked_board(
+    c: Any, table: BoardTable, plant: LinearPlant, certificate: Certificate, steps: int
+) -> tuple[int, int, float]:
+    """Returns guaranteed steps, how many were outside, and how far the state got, 1 at the boundary of the set."""
+    rng, polytope, (n, m, _, h, _) = np.random.default_rng(0), certificate.polytope, table.sizes.values()
+    assert polytope is not None
+    memory = ctypes.create_string_buffer(8 * (2 * n + (h + 1) * m) + 64)
+    reason = np.frombuffer(memory, np.int32)[2 * (2 * n + (h + 1) * m) + 5 :]  # after five counters
+    u, found = np.zeros(m), [0, 0, 0.0]
+    noises = plant.nominal_disturbance, plant.nominal_sensor_error
+
+    def at(numbers: np.ndarray) -> ctypes.c_void_p:
+        return ctypes.c_void_p(numbers.ctypes.data)
+
+    for episode in range(steps // _EPISODE):
+        x = rng.standard_normal(n) * plant.half_widths
+        x = polytope.center + rng.uniform(0.5, 0.999) / polytope.gauge(polytope.center + x) * x
+        assert c.ncs_start(memory, episode, at(x + plant.nominal_initial_error.sample_boundary(rng)))
+        taken: list[np.ndarray] = []
+        for step in range(_EPISODE):
+            if step % _PATIENCE == 0:
+                oldest, mixes = int(rng.integers(h + 1)), rng.random() < 0.5
+            f = polytope.F[(polytope.F @ (plant.A @ x + plant.B @ u - polytope.center)).argmax()]
+            d, v = (_pushed(each, row, rng) for each, row in zip(noises, (f, -plant.H @ f), strict=True))
+            taken.append(plant.H @ x + v)
+            ages = [h, oldest, *rng.integers(h + 1, size=2 * mixes).tolist()]
+            for age in sorted((each for each in ages if step - each >= 1), reverse=True):
+                c.ncs_receive(memory, episode, step - age, at(taken[step - age]))
+            outwards = np.where(plant.B.T @ f > 0.0, plant.input_high, plant.input_low)
+            proposed = rng.choice([outwards, rng.uniform(1.5 * plant.input_low, 1.5 * plant.input_high), np.nan * u])
+            c.ncs_decide(memory, at(proposed), at(u))
+            if reason[0] == GUARANTEED:
+                outside = polytope.gauge(x) > 1.0 + 1e-9 or plant.constraint_values(x).max() > 1e-9
+                found = [found[0] + 1, found[1] + outside, max(found[2], polytope.gauge(x))]
+            x = plant.A @ x + plant.B @ u + d
+    return found[0], found[1], found[2]
+
+
+def _pushed(noise: Ellipsoid, row: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Returns what of a noise moves farthest along a row, or now and then any of its extremes."""
+    size = noise.support(row)
+    return noise.sample_boundary(rng) if size == 0.0 or rng.random() < 0.2 else noise.shape_matrix @ row / size
+
+
 def certified(name: str, plant: LinearPlant) -> Certificate:
     """Returns a certificate of a published plant that verifies; raises Infeasible if none is found."""
     certificate = synthesize(plant, contract=contract_of_plant(name))
@@ -234,7 +311,7 @@ def largest_share(plant: LinearPlant) -> float | None:
     return kept / len(points)
 
 
-COMMANDS = (shares, attack, impossible)
+COMMANDS = (shares, attack, impossible, board)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

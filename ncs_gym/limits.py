@@ -386,7 +386,7 @@ class Limits(ReadOnlyArrays):
             return given
         if model.at is not None or not (widths > 0.0).all():
             raise ValueError(
-                f"{name} limits must be positive half-widths, or a pair (low, high) as beside at= of a Model, where "
-                f"they are absolute, got {shown(given)}"
+                f"{name} limits must be positive half-widths, or a pair (low, high) of vectors, as beside at= of a "
+                f"Model, where they are absolute, got {shown(given)}"
             )
         return -widths, widths

@@ -12,16 +12,16 @@ from ncs_gym import exact
 from ncs_gym.validation import (
     SMALLEST_NUMBER,
     ReadOnlyArrays,
-    as_count,
     as_given,
     as_matrix,
     as_number,
     as_numbers,
+    as_setting,
     as_vector,
     shown,
 )
 
-LONGEST_INPUT_DELAY = 100
+LONGEST_DELAY = 100
 # Durations of steps that differ by less than this are the same.
 SAME_STEP = 1e-9
 # The constant of x+ = A x + B u + c may differ by this from what an equilibrium needs, relative to its terms.
@@ -73,7 +73,7 @@ class Model(ReadOnlyArrays):
         offset: c of a model in absolute coordinates, x+ = A x + B u + c, shape (n,): then `at` has to be an
             equilibrium.
         continuous: [Ac, Bc] of x' = Ac x + Bc u that A and B were sampled from, shape (n, n + m); None if unknown.
-        delays: Steps after which an input takes effect (`with_delays`).
+        delays: Steps after which each input acts on each state, shape (n, m) (`with_delays`).
         state, input: `at`, zero where it is None.
 
     Raises:
@@ -87,7 +87,7 @@ class Model(ReadOnlyArrays):
     at: Any = None
     offset: Any = None
     continuous: Any = None
-    delays: int = 0
+    delays: Any = 0
     state: np.ndarray = field(init=False, repr=False)
     input: np.ndarray = field(init=False, repr=False)
 
@@ -113,7 +113,7 @@ class Model(ReadOnlyArrays):
         _ = self.lacking  # which refuses a point that is no equilibrium
         if self.continuous is not None:
             self._set(continuous=as_matrix(self.continuous, (n, n + B.shape[1]), "continuous"))
-        self._set(delays=as_count(self.delays, "delays", low=0, high=LONGEST_INPUT_DELAY))
+        self._set(delays=_steps(self.delays, B.shape, "delays"))
 
     @cached_property
     def lacking(self) -> np.ndarray:
@@ -195,14 +195,51 @@ class Model(ReadOnlyArrays):
         n = len(self.A)
         return zero_order_hold(self.continuous[:, :n], as_matrix(E, (n, None), "E"), self.dt)[1]
 
-    def with_delays(self, steps: int) -> Self:
-        """Returns the model whose inputs take effect so many steps later; those under way become further states."""
-        return replace(self, delays=steps)
+    def with_delays(self, inputs: Any = None, outputs: Any = 0) -> Self:
+        """Returns the model of x_i+ = (A x)_i + sum_j B_ij u_j(k - d_ij), y_l = H_l x(k - e_l) + v_l(k).
+
+        Inputs under way become further states of a `LinearPlant`, which knows them: limits and bounds speak of the
+        model's own states alone. Past outputs, each H_l x, the newest first, become the last of the model's own states:
+        limits and bounds speak of them too, with no limit, no disturbance, and the error of a first estimate.
+
+        Args:
+            inputs: d, whole steps: a number, one for each input, shape (m,), or for each state and input, shape (n, m),
+                as of a matrix of lags with dead times; None for what they are.
+            outputs: e, whole steps: a number, or one for each output, shape (p,).
+
+        Raises:
+            ValueError: If they are no such steps.
+        """
+        n, m = self.B.shape
+        d = self.delays if inputs is None else _steps(inputs, (n, m), "delays")
+        e = _steps(outputs, (len(self.H),), "delays of outputs")
+        if not (held := int(e.sum())):
+            return replace(self, delays=d)
+        A, H, first = np.pad(self.A, (0, held)), np.pad(self.H, ((0, 0), (0, held))), n
+        for row, steps in zip(H, e.tolist(), strict=True):
+            if steps:
+                A[first : first + steps, first - 1 : first + steps - 1] = np.eye(steps)
+                A[first], row[:] = row, np.eye(n + held)[first + steps - 1]
+                first += steps
+        state = np.concatenate([self.state, np.repeat(self.H @ self.state, e)])
+        c = None if self.offset is None else np.pad(self.offset, (0, held))
+        at = None if self.at is None else (state, self.input)
+        B, d = np.pad(self.B, ((0, held), (0, 0))), np.pad(d, ((0, held), (0, 0)), mode="maximum")
+        return replace(self, A=A, B=B, H=H, at=at, offset=c, continuous=None, delays=d)
 
 
 def _square(A: Any) -> np.ndarray:
     A = as_matrix(A, (None, None), "A")
     return as_matrix(A, (len(A), len(A)), "A")
+
+
+def _steps(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """Returns whole steps of the given shape; raises ValueError if they are none."""
+    steps, shapes = as_setting(value), [*dict.fromkeys((shape[-1:], shape))]
+    if steps is None or steps.shape not in ((), *shapes) or not np.isin(steps, np.arange(LONGEST_DELAY + 1)).all():
+        one = f"{name} must be a whole number of steps from 0 to {LONGEST_DELAY}"
+        raise ValueError(f"{one}, or such numbers of shape {' or '.join(map(str, shapes))}, got {shown(value)}")
+    return np.broadcast_to(steps, shape).astype(int)
 
 
 def residual(

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from textwrap import fill
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,22 +31,6 @@ _PART = 200
 _FURTHER = 2
 
 
-class Growth(NamedTuple):
-    """That the disturbance along a direction grows with the size of a signal.
-
-    Attributes:
-        direction: Name of the direction.
-        signal: Name of the state or input.
-        change: Over the range of |signal|, in units of the mean.
-        t: Student's t of the slope, of as many independent steps as the autocorrelations leave.
-    """
-
-    direction: str
-    signal: str
-    change: float
-    t: float
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RecordedBounds(ReadOnlyArrays):
     """Half-widths of a disturbance E s, direction by direction, from a recording.
@@ -63,8 +47,7 @@ class RecordedBounds(ReadOnlyArrays):
             several steps this takes for granted that none was larger closer to an end of the record than that.
         sensor: Half-widths of the sensor noise that all these take for granted, shape (p,).
         left: Share of the second half's steps whose disturbance may exceed all of the first half's, shape (q,).
-        longest: The longest run of such steps, shape (q,).
-        grows: Where disturbances grow with a state or an input: the model is wrong, not the bound.
+        grows: Sentences, where disturbances grow with a state or an input: the model is wrong, not the bound.
         first_error: Half-widths of the error of a state that is read off one sample, shape (n,); infinite where one
             sample does not tell.
     """
@@ -79,8 +62,7 @@ class RecordedBounds(ReadOnlyArrays):
     upper: np.ndarray
     sensor: np.ndarray
     left: np.ndarray
-    longest: np.ndarray
-    grows: tuple[Growth, ...]
+    grows: tuple[str, ...]
     first_error: np.ndarray
 
     def __post_init__(self) -> None:
@@ -105,7 +87,7 @@ class RecordedBounds(ReadOnlyArrays):
             name = self.directions[int(np.argmin(np.isfinite(half)))]
             raise ValueError(
                 f"these outputs leave no upper bound of {name}: measure more, give fewer directions, or declare a "
-                'multiple of what explains the record, of="explaining"'
+                'multiple of what explains the record, of="explaining" (--of explaining)'
             )
         if first_error is None:
             if not np.isfinite(self.first_error).all():
@@ -115,48 +97,31 @@ class RecordedBounds(ReadOnlyArrays):
         disturbance = Box(-half, half) if is_identity else Through(self.E, half)
         return Bounds(disturbance, self.sensor, first_error)
 
-    @property
-    def document(self) -> dict[str, Any]:
-        """All attributes as JSON values; None stands for infinity."""
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
-        values = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in values.items()}
-        for name in ("upper", "first_error"):
-            values[name] = [each if np.isfinite(each) else None for each in values[name]]
-        return values | {"grows": [each._asdict() for each in self.grows]}
-
     def __str__(self) -> str:
         noise = ", ".join(f"{name} {half:.3g}" for name, half in zip(self.outputs, self.sensor, strict=True))
         width = max(9, *map(len, self.directions))
         lines = [
             fill(f"Half-widths of the disturbance of a step, of {counted(self.steps, 'step')}, if sensor noise was "
                  f"within {noise}.", 80),
-            f"{'direction':<{width}}  at least  explaining   at most  left [%]  in a row",
+            f"{'direction':<{width}}  at least  explaining   at most  left [%]",
         ]  # fmt: skip
         for i, name in enumerate(self.directions):
             most = f"{self.upper[i]:.3g}" if np.isfinite(self.upper[i]) else "none"
             lines.append(
                 f"{name:<{width}}  {self.lower[i]:8.3g}  {self.explaining[i]:10.3g}  {most:>8}  "
-                f"{100.0 * self.left[i]:8.3g}  {self.longest[i]:8d}"
+                f"{100.0 * self.left[i]:8.3g}"
             )
-        return "\n".join([*lines, *(fill(each, 80) for each in self._sentences())])
-
-    def _sentences(self) -> list[str]:
         ends = f", unless one did within {counted(self.window, 'step')} of its ends" if self.window > 1 else ""
-        most, run = 100.0 * self.left.max(), counted(int(self.longest.max()), "step")
-        sentences = [
+        sentences = (
             'If the model is right, this record proves that disturbances as large as "at least" occurred, and none '
             f'beyond "at most"{ends}.',
             "It does not prove that none larger will occur: up to "
-            f"{most:.3g} % of the second half's steps, {run} in a row, may exceed all of the first half's (left).",
+            f"{100.0 * self.left.max():.3g} % of the second half's steps may exceed all of the first half's (left).",
             "The factor that you declare is your claim, which further records on other days support, and more steps of "
             "the same one do not.",
-        ]
-        for name, signal, change, t in self.grows:
-            sentences.append(
-                f"The disturbance {name} grows with |{signal}|, by {change:.2g} times its mean (t = {t:.3g}): mend the "
-                "model, since no bound of this record holds for larger ones."
-            )
-        return sentences
+            *self.grows,
+        )
+        return "\n".join([*lines, *(fill(each, 80) for each in sentences)])
 
 
 def bounds_from_recording(
@@ -196,7 +161,11 @@ def bounds_from_recording(
     u, y = as_matrix(inputs, (None, m), "inputs") - model.input, as_matrix(outputs, (None, p), "outputs")
     if len(y) - len(u) not in (0, 1):
         raise ValueError(f"outputs must have as many rows as inputs, or one more, got {len(y):,} and {len(u):,}")
-    y, u = (y - H @ model.state)[model.delays :], u[: max(len(y) - 1 - model.delays, 0)]
+    u, late = u[: len(y) - 1], int(model.delays.max())
+    taken = [u[late - each : max(len(u) - each, 0)] for each in range(late + 1)]  # by the steps that they are late
+    pushed = sum(each @ np.where(model.delays == d, model.B, 0.0).T for d, each in enumerate(taken))
+    u = np.column_stack([taken[d][:, j] for j, d in enumerate(model.delays.max(axis=0).tolist())])
+    y = (y - H @ model.state)[late:]
     is_identity, E = E is None, np.eye(n) if E is None else as_matrix(E, (n, None), "E")
     if not np.abs(E).max(axis=0).all():
         raise ValueError("every direction of E must move a state, one is zero")
@@ -206,7 +175,7 @@ def bounds_from_recording(
     names = {"states": [f"x{i + 1}" for i in range(n)], "inputs": [f"u{i + 1}" for i in range(m)]}
     for each, default in names.items():
         names[each] = [*as_names([*(labels or {}).get(each, ())], tuple(default), f"names of {each}")]
-    record = _Record(model, E, u, y)
+    record = _Record(model, E, u, pushed, y)
     phi = np.broadcast_to(known, p).copy()
     explaining = record.explaining(phi, weights)
     upper, found, noise = record.upper(phi)
@@ -228,9 +197,9 @@ def bounds_from_recording(
         upper=upper,
         sensor=phi,
         left=may_leave.mean(axis=0),
-        longest=np.array([_longest_run(each) for each in may_leave.T]),
         grows=tuple(
-            Growth(name, signals[j], change, t)
+            f"The disturbance {name} grows with |{signals[j]}|, by {change:.2g} times its mean (t = {t:.3g}): mend the "
+            "model, since no bound of this record holds for larger ones."
             for name, (t, change, j) in zip(directions, record.growths(found, noise), strict=True)
             if t > _LEAST_T and change > _LEAST_GROWTH
         ),
@@ -244,24 +213,20 @@ def output_names(H: np.ndarray, states: Sequence[str]) -> list[str]:
     return [str(states[row.argmax()]) if alone[j] else f"y{j + 1}" for j, row in enumerate(H)]
 
 
-def _longest_run(flags: np.ndarray) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
-
-
 class _Record:
     """A record, whose outputs over some steps are O x + (what inputs did) + S s + v.
 
     Attributes:
         u, y: Deviations, shapes (N, m) and (N + 1, p).
+        pushed: What inputs add to each step, shape (N, n).
         index: Observability index nu.
         window: Number of steps of the windows that tell one disturbance, in their middle.
         read: Left inverse of O of nu samples, shape (n, nu p).
         y_unit, s_unit: Sizes of noise and of disturbances that explain the record alone, shapes (p,) and (q,).
     """
 
-    def __init__(self, model: Model, E: np.ndarray, u: np.ndarray, y: np.ndarray):
-        self.model, self.E, self.u, self.y, n, p = model, E, u, y, len(model.A), len(model.H)
+    def __init__(self, model: Model, E: np.ndarray, u: np.ndarray, pushed: Any, y: np.ndarray):
+        self.model, self.E, self.u, self.pushed, self.y, n, p = model, E, u, pushed, y, len(model.A), len(model.H)
         self.index = nu = next((each for each in range(1, n + 1) if _rank(self.of_state(each - 1)) == n), 0)
         if not nu:
             raise ValueError("the model is not observable: its outputs never tell all states, measure another one")
@@ -296,7 +261,7 @@ class _Record:
         count = len(self.u) - steps + 1
         seen, moved = [self.y[:count]], np.zeros((count, len(self.E)))
         for j in range(steps):
-            moved = moved @ self.model.A.T + self.u[j : j + count] @ self.model.B.T
+            moved = moved @ self.model.A.T + self.pushed[j : j + count]
             seen.append(self.y[j + 1 : j + 1 + count] - moved @ self.model.H.T)
         return np.hstack(seen)
 

@@ -2,55 +2,54 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import tyro
 
-from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
-from experiments.settings import require_one_plant
-from ncs_gym import LinearPlant, Through, bounds_from_recording
+from ncs_gym import LinearPlant, Sum, Through, bounds_from_recording
 from ncs_gym.network.log_files import table_rows
 from ncs_gym.reading import LARGEST_LOG, read_file, require_packets
 from ncs_gym.recording import output_names
 from ncs_gym.validation import counted, shown
-from shields.atomic_write import write_atomically
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoundsSettings:
-    """Reads a record of a plant, and says what bounds of its disturbances the record proves.
+    """Says what bounds of a plant's disturbances a record of it proves, and writes the plant with such bounds.
 
     Attributes:
         file: A table (CSV, or Parquet where pyarrow is installed) with the plant's inputs and outputs by name as
             columns and a row per step: outputs as sampled, then the input that acted, which may be empty in the last
             row. An output that is not a state is y1, y2, ... by its number. Further columns are not read.
-        env: Id of an environment with the plant, or module:id, which first imports the module.
-        plant: File of the plant (`LinearPlant.save`), in place of an environment's. Its disturbance says along which
-            directions to seek: E of Through(E, ...), else every state.
+        plant: File of the plant (`LinearPlant.save`). Its disturbance says along which directions to seek: E of
+            Through(E, ...), else every state.
         sensor: Half-widths of the noise of each output, as of a data sheet; by default the plant's own.
-        out: File for the numbers (JSON).
+        factor: Writes the plant with this many times (>= 1) the half-widths found: your claim of what may still come.
+        of: Which half-widths: "upper", or "explaining" where outputs leave no upper bound.
+        out: File for the plant with these bounds, for `ncs synthesize --plant`. Sensor noise is as above; the first
+            error is what one sample tells, or the plant's own where one does not tell all states.
     """
 
     file: tyro.conf.Positional[Path]
-    env: str | None = None
-    plant: Path | None = None
+    plant: Path
     sensor: tuple[float, ...] = ()
+    factor: float | None = None
+    of: Literal["upper", "explaining"] = "upper"
     out: Path | None = None
 
     def __post_init__(self) -> None:
-        require_one_plant(self)
-        if self.env is None and self.plant is None:
-            raise ValueError("give the plant of the record: --plant FILE or --env ID")
+        if (self.factor is None) != (self.out is None):
+            raise ValueError("a plant is written with --out FILE and --factor, by which you multiply what was found")
 
 
 def bounds(settings: BoundsSettings) -> None:
     """Runs `ncs bounds`."""
     require_place(settings.out)
-    plant = LinearPlant.load(settings.plant) if settings.plant else registered_env(settings.env or "").plant
+    plant = LinearPlant.load(settings.plant)
     n = len(plant.model.A)
     outputs = output_names(plant.model.H, plant.state_names[:n])
     inputs, measured = _read(settings.file, [*plant.input_names], outputs)
@@ -60,9 +59,12 @@ def bounds(settings: BoundsSettings) -> None:
     labels = {"states": dict.fromkeys(plant.state_names[:n]), "inputs": dict.fromkeys(plant.input_names)}
     found = bounds_from_recording(plant.model, inputs, measured, E, sensor=sensor, labels=labels)
     print(found)
-    if settings.out is not None:
-        document = {"plant": plant.fingerprint} | found.document
-        write_atomically(settings.out, json.dumps(document, indent=1) + "\n")
+    if settings.out is not None and settings.factor is not None:
+        first = None if np.isfinite(found.first_error).all() else plant.bounds.first_error
+        given = found.bounds(settings.factor, of=settings.of, first_error=first)
+        disturbance = Sum((given.disturbance, *(each for each in parts if each.is_left_out)))  # a remainder stays
+        replace(plant, bounds=replace(given, disturbance=disturbance)).save(settings.out)
+        print(f"saved to {settings.out}")
 
 
 def _read(path: Path, inputs: list[str], outputs: list[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -33,8 +33,9 @@ def described(plant: BetweenSamples) -> str:
         "input limits": [row_limit(plant, j) for j in range(k, together)],
         "both together": [row_limit(plant, j) for j in range(together, together + len(plant.mixed_rows))],
     }
-    if plant.model.delays:
-        lines["input limits"].append(f"inputs take effect {counted(plant.model.delays, 'step')} later")
+    if longest := int(plant.model.delays.max()):
+        up_to = "up to " if np.ptp(plant.model.delays) else ""
+        lines["input limits"].append(f"inputs take effect {up_to}{counted(longest, 'step')} later")
     if plant.between_samples is not None:
         lines["safe box"].append(f"at all times: at {plant.between_samples} of each step, and bounded between them")
     own = plant.n - plant.past  # past inputs are known, and their rows limit nothing: inputs have limits

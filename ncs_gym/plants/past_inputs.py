@@ -11,34 +11,51 @@ from ncs_gym.limits import LimitValues, Rows
 STORED_INPUT_REACH = 4.0
 
 
-def with_past_inputs(own: LimitValues, delay: int, change: np.ndarray | None) -> LimitValues:
+def acting(delays: np.ndarray, past: int) -> np.ndarray:
+    """Returns where among past and then present inputs those are that act now, shape (m,), by delays of shape (n, m).
+
+    Raises:
+        ValueError: If an input acts on several states with several delays.
+    """
+    if np.ptp(delays, axis=0).any():
+        raise ValueError(
+            "another process, or a limit of states and inputs together, needs one delay per input, as in "
+            "Model.with_delays([2, 0]), not one per state and input"
+        )
+    return past - delays.shape[1] * delays[0] + np.arange(delays.shape[1])
+
+
+def with_past_inputs(own: LimitValues, delays: np.ndarray, change: np.ndarray | None) -> LimitValues:
     """Returns the plant with the inputs that it has to remember as further states: x, u_{k-d}, .., u_{k-1}.
 
     Args:
         own: The plant of its own states.
-        delay: d, the steps after which an input takes effect.
+        delays: Steps after which each input acts on each state, shape (n, m); d is the largest.
         change: Largest change of each input from one step to the next, shape (m,); None for any.
+
+    Raises:
+        ValueError: If limits of states and inputs together do not say which of several past inputs they mean.
     """
-    (n, m), half = own.B.shape, own.input_half
-    stored = m * (delay or int(change is not None))
+    (n, m), half, d = own.B.shape, own.input_half, int(delays.max())
+    stored = m * (d or int(change is not None))
     if not stored:
         return own
     A, B = np.zeros((n + stored, n + stored)), np.zeros((n + stored, m))
-    A[:n, :n], A[n:-m, n + m :] = own.A, np.eye(stored - m)
-    if delay:
-        A[:n, n : n + m] = own.B
-    else:
-        B[:n] = own.B
-    B[-m:] = np.eye(m)
+    A[:n, :n], A[n:-m, n + m :], B[-m:] = own.A, np.eye(stored - m), np.eye(m)
+    B[:n] = np.where(delays == 0, own.B, 0.0)
+    for steps in range(1, d + 1):
+        A[:n, n + stored - m * steps :][:, :m] = np.where(delays == steps, own.B, 0.0)
     past = np.hstack([np.zeros((stored, n)), np.diag(np.tile(1.0 / (STORED_INPUT_REACH * half), stored // m))])
     box = [Rows(np.pad(own.box, ((0, 0), (0, stored))), own.box_ends)]
     box += [Rows(past, np.tile(own.input_ends / half, stored // m))]
     # An input that takes effect later is in the limits of states and inputs when it does, and a state by then.
     of_state, of_input = own.mixed_rows[:, :n], own.mixed_rows[:, n:]
-    others = np.zeros((len(of_state), stored + (0 if delay else m)))
-    others[:, slice(m) if delay else slice(stored, None)] = of_input
-    coupled, mixed = Rows(np.hstack([of_state, others]), own.mixed_ends), []
-    (box if delay else mixed).append(coupled)
+    others = np.zeros((len(of_state), stored + m))
+    if len(others):
+        others[:, acting(delays, stored)] = of_input
+    is_now, coupled = others[:, stored:].any(axis=1), np.hstack([of_state, others])
+    box.append(Rows(coupled[~is_now, : n + stored], own.mixed_ends[:, ~is_now]))
+    mixed = [Rows(coupled[is_now], own.mixed_ends[:, is_now])]
     if change is not None:
         rates = np.hstack([np.zeros((m, n + stored - m)), -np.eye(m), np.eye(m)]) / change[:, None]
         mixed.append(Rows(rates, np.outer([-1.0, 1.0], np.ones(m))))

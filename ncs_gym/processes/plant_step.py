@@ -10,6 +10,7 @@ import numpy as np
 
 from ncs_gym.bounds import Bounds
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.past_inputs import acting
 from ncs_gym.processes.process import FamilyProcess, LinearProcess, Process, own_process
 from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, stays_inside
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -83,6 +84,7 @@ class PlantSimulation:
         self._is_linear, moves_all = isinstance(given, LinearProcess), isinstance(given, LinearProcess | FamilyProcess)
         self._moved = plant if moves_all or not plant.past else _without_past_inputs(plant)
         self.process = given.opened(self._moved, size)
+        self._acting = None if self._moved is plant else acting(plant.model.delays, plant.past)
         self.plant, self._model = plant if self._is_linear else plant.without_remainder, plant
         self.disturbance, self.size = disturbance, size
         self._truncated, self._is_extreme = noise != "gaussian", noise == "extreme"
@@ -241,8 +243,8 @@ class PlantSimulation:
             return self._watched(x_next, nominal) if self._may_leave else x_next
         step = self.process.step if self.size is None else self.process.step_many
         x, past = state[: self._moved.n], state[self._moved.n :]
-        acting = past[: len(u)] if len(past) and self._model.model.delays else u
-        x_next = np.array(step(self._moved, guarded(x), acting))  # which others may write over
+        due = u if self._acting is None else np.concatenate([past, u])[self._acting]
+        x_next = np.array(step(self._moved, guarded(x), due))  # which others may write over
         if len(past):
             x_next = np.concatenate([x_next, past[len(u) :], u])
         if self._is_disturbed:

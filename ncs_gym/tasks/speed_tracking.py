@@ -78,7 +78,7 @@ class SpeedTracking(Task):
     def check(self, plant):  # noqa: D102
         if self.input_index >= plant.m:
             return f"input_index must be < {plant.m}, got {self.input_index}"
-        if plant.model.delays:
+        if plant.model.delays.any():
             return "inputs of a plant with delays act later than the task's speed moves: give it as a downlink"
         if (center := float(plant.operating_input[self.input_index])) != 0.0:
             return f"the input is an acceleration, which the operating point must count from zero, got {center:g}"

@@ -116,27 +116,32 @@ def _found(
 ) -> Certificate | Infeasible:
     """Returns a verified certificate, of an ellipsoid if one is found, else of a polytope alone, or why there is none.
 
+    Where most states are past inputs, a polytope alone comes first.
+
     Raises:
         TimeoutError, KeyboardInterrupt: Where the search is ended; it holds what was reached.
     """
     is_centered = rest is None and not needs_resting_point(plant)
-    fixed, failure = at_operating_point(plant) if is_centered else rest, None
+    fixed, found, failure = at_operating_point(plant) if is_centered else rest, None, None
+    sought = ["ellipsoid"] * is_centered + ["polytope"] * polytope
+    if 2 * plant.past > plant.n:  # an ellipsoid of mostly past inputs takes minutes, and adds nothing
+        sought.reverse()
     try:
         search("gains, and what they bear")
         gains = tolerated_gains(plant, contract, fixed)
-        found = None
-        if is_centered:
-            try:
-                found = largest_ellipsoid(plant, contract, [each.K for each in gains], search, start, alternations)
-            except Infeasible as none:
-                failure = none
-        if found is None and polytope:
+        while sought and found is None:
             search.candidate = None
-            found = around_resting_point(plant, contract, gains, search, fixed)
+            try:
+                if sought.pop(0) == "polytope":
+                    found = around_resting_point(plant, contract, gains, search, fixed)
+                else:
+                    found = largest_ellipsoid(plant, contract, [each.K for each in gains], search, start, alternations)
+            except Infeasible as none:
+                failure = failure or none
         if found is None:
             return failure or infeasibility(plant, most_tolerated(plant, contract, polytope=False), polytope=False)
     except Infeasible as none:
-        return failure or none
+        return none
     scale = max([1.0, *(each.margin for each in gains)])  # it is 1 at least, because this certificate exists
     return replace(found, provenance=found.provenance | {"tolerated_scale": float(exact.rounded(scale, 3))})
 

@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 from ncs_gym import (
     Bounds,
     Box,
+    FunctionProcess,
     Gaussian,
     Limits,
     LinearPlant,
@@ -21,6 +22,7 @@ from ncs_gym import (
     Through,
     linear_model,
 )
+from tests.product import gym_env
 
 A, B = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.5]])
 MODEL, ABOUT = Model(A, B, None, dt=0.1), Model(A, B, None, dt=0.1, at=([1.0, 2.0], 0.5))
@@ -47,6 +49,59 @@ def test_past_inputs_are_known_since_delays_and_rates_made_them():
     slow = LinearPlant(MODEL, Limits([1.0, 2.0], 1.0, rate=0.3), BOUNDS)
     assert (slow.n, slow.past) == (3, 1)
     assert LinearPlant(MODEL, Limits([1.0, 2.0], 1.0), BOUNDS).past == 0
+
+
+@pytest.mark.parametrize("d", [3, [2, 0], [[0, 1], [3, 1]]], ids=["all", "per input", "per state and input"])
+@pytest.mark.parametrize("e", [0, [2, 0, 1]], ids=["now", "late"])
+def test_delays_of_each_channel_are_those_of_the_formula(d, e):
+    rng = np.random.default_rng(0)
+    H, B2, point = rng.normal(size=(3, 2)), rng.normal(size=(2, 2)), ([1.0, 2.0], [0.5, -0.5])
+    model = Model(A, B2, H, 0.1, at=point).with_delays(d, e)
+    held = len(model.A) - 2
+    free = np.full(held, np.inf)
+    limits = Limits(([-9.0, -9.0, *-free], [9.0, 9.0, *free]), ([-2.0] * 2, [2.0] * 2))
+    plant = LinearPlant(model, limits, Bounds([0.1, 0.1, *np.zeros(held)], 0.01, np.full(2 + held, 0.1)))
+    late, behind = np.broadcast_to(d, (2, 2)), np.broadcast_to(e, 3)
+    np.testing.assert_allclose(plant.operating_state[: 2 + held], [1.0, 2.0, *np.repeat(H @ [1.0, 2.0], behind)])
+    assert (plant.past, plant.p) == (2 * late.max(), 3)
+    u, x, whole = rng.normal(size=(20, 2)), [np.zeros(2)], np.zeros(plant.n)
+    for k in range(20):
+        expected = [H[i] @ x[k - back] if k >= back else 0.0 for i, back in enumerate(behind)]
+        np.testing.assert_allclose(plant.H @ whole, expected, atol=1e-12)
+        acting = np.array([[u[k - s, j] if k >= s else 0.0 for j, s in enumerate(row)] for row in late])
+        x.append(A @ x[k] + (B2 * acting).sum(axis=1))
+        whole = plant.A @ whole + plant.B @ u[k]
+    document = json.loads(json.dumps(plant.document))
+    assert LinearPlant.load(document).fingerprint == plant.fingerprint
+
+
+def test_delays_of_inputs_stay_beside_those_of_outputs_given_later():
+    twice = MODEL.with_delays([2]).with_delays(outputs=[0, 1])
+    np.testing.assert_array_equal(twice.delays, np.full((3, 1), 2))
+    assert LinearPlant(twice, Limits([1.0, 2.0, np.inf], 1.0), Bounds([0.1, 0.1, 0.0], 0.1, 0.1)).n == 5
+
+
+def test_a_process_moves_with_the_input_that_acts_then_and_takes_one_delay_per_input():
+    B2 = np.array([[1.0, 0.2], [0.3, 1.0]])
+    late = Model(A, B2, None, 0.1, at=([0.5, 0.0], [0.1, -0.1])).with_delays([2, 0])
+    plant = LinearPlant(late, Limits(([-9.0, -9.0], [9.0, 9.0]), ([-1.0, -1.0], [1.0, 1.0])), Bounds(0.0, 0.0, 0.0))
+    process = FunctionProcess(lambda x, u: A @ x + B2 @ u)  # in deviations, as everything
+    own, other = (gym_env(plant=plant, process=each) for each in (None, process))
+    assert own.reset(seed=0)[1]["state"] == pytest.approx(other.reset(seed=0)[1]["state"])
+    for action in np.random.default_rng(1).uniform(-1.0, 1.0, (8, 2)):
+        assert own.step(action)[4]["state"] == pytest.approx(other.step(action)[4]["state"], abs=1e-12)
+    each = replace(plant, model=late.with_delays([[2, 0], [1, 0]]))
+    with pytest.raises(ValueError, match=r"another process, .* needs one delay per input"):
+        gym_env(plant=each, process=process)
+
+
+def test_limits_of_states_and_inputs_together_are_of_the_input_that_acts_then():
+    model, rows = Model(A, np.eye(2), None, 0.1), [([1.0, 0.0], [2.0, 0.0], -1.0, 1.0), ([0.0, 1.0], [1.0, 3.0], -1, 1)]
+    plant = LinearPlant(model.with_delays([2, 0]), Limits([1.0, 2.0], 1.0, rows), BOUNDS)
+    np.testing.assert_array_equal(plant.box[-1], [1.0, 0.0, 2.0, 0.0, 0.0, 0.0])  # u1 of two steps ago
+    np.testing.assert_array_equal(plant.mixed_rows, [[0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 3.0]])
+    with pytest.raises(ValueError, match="a limit of states and inputs together, needs one delay per input"):
+        LinearPlant(model.with_delays([[2, 0], [1, 0]]), Limits([1.0, 2.0], 1.0, rows), BOUNDS)
 
 
 @pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
@@ -118,6 +173,8 @@ def test_numbers_of_a_plant_are_its_own_whatever_they_came_in(kind):
             r"at=\(state, input\) of the Model",
         ),
         (lambda: MODEL.with_delays(-1), "delays must be a whole number"),
+        (lambda: MODEL.with_delays([1, 2]), r"or such numbers of shape \(1,\) or \(2, 1\), got \[1, 2\]"),
+        (lambda: MODEL.with_delays(outputs=0.5), r"delays of outputs must be .* or such numbers of shape \(2,\), got"),
         (
             lambda: LinearPlant(MODEL, LIMITS, Bounds(Gaussian(np.eye(2), 0.1), Gaussian(np.eye(2), 0.2), 0.0)),
             "the same delta",

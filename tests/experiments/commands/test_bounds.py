@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -36,18 +34,51 @@ def files(tmp_path):
 @pytest.mark.parametrize("name", ["record.csv", "record.parquet"])
 def test_bounds_of_a_table_are_those_of_its_columns(name, files):
     folder, table = files
-    said = succeeded("bounds", folder / name, "--plant", folder / "p.json", "--out", folder / "b.json").prose
+    said = succeeded("bounds", folder / name, "--plant", folder / "p.json").prose
     u, y = table[["force"]].to_numpy()[:-1], table[["position", "y2"]].to_numpy()
     expected = bounds_from_recording(MODEL, u, y, E, sensor=0.001, labels=LABELS)
-    left = json.loads((folder / "b.json").read_text())
-    assert left.pop("plant") == LinearPlant.load(folder / "p.json").fingerprint
-    assert left == json.loads(json.dumps(expected.document))
     assert " ".join(str(expected).split()) in said
     assert "if sensor noise was within position 0.001, y2 0.001." in said
 
 
-def test_sensors_are_given(files):
+def test_a_factor_writes_the_plant_with_the_bounds_found(files):
+    """As `ncs synthesize --plant` takes it: with all else as it was, also the first error, which no sample tells."""
+    folder, table = files
+    given = LinearPlant.load(folder / "p.json")
+    command = ["bounds", folder / "record.csv", "--plant", folder / "p.json", "--out", folder / "found.json"]
+    said = succeeded(*command, "--factor", 1.5, "--sensor", 0.002, 0.003).prose
+    u, y = table[["force"]].to_numpy()[:-1], table[["position", "y2"]].to_numpy()
+    expected = bounds_from_recording(MODEL, u, y, E, sensor=[0.002, 0.003])
+    made = LinearPlant.load(folder / "found.json")
+    assert made.bounds.disturbance.parts[0].set.half == pytest.approx(1.5 * expected.upper)
+    assert (made.bounds.sensor.parts[0].half == [0.002, 0.003]).all()
+    assert made.bounds.first_error.parts[0].half == pytest.approx(expected.first_error)
+    assert (made.labels, made.limits.input, made.region) == (given.labels, given.limits.input, given.region)
+    assert f"saved to {folder / 'found.json'}" in said
+
+
+def test_what_one_sample_does_not_tell_stays_the_plants_own(tmp_path):
+    model = Model.sampled([[0, 1], [0, -0.5]], [[0], [1]], [[1, 0]], 0.1)
+    bounds = Bounds(Through(E, 0), 0.001, [0.01, 0.05])
+    LinearPlant(model, Limits(state=[1, 2], input=2), bounds).save(tmp_path / "p.json")
+    rng, x, rows = np.random.default_rng(0), np.zeros(2), []
+    for _ in range(80):
+        u = rng.uniform(-1, 1, 1)
+        rows.append([*(model.H @ x), *u])
+        x = model.A @ x + model.B @ u + np.array(E) @ rng.uniform(-0.1, 0.1, 1)
+    pd.DataFrame(rows, columns=["x1", "u1"]).to_csv(tmp_path / "r.csv", index=False)
+    command = ["bounds", tmp_path / "r.csv", "--plant", tmp_path / "p.json", "--out", tmp_path / "o.json"]
+    succeeded(*command, "--factor", 2, "--of", "explaining")
+    made = LinearPlant.load(tmp_path / "o.json").bounds
+    assert made.first_error.parts[0].half.tolist() == [0.01, 0.05]
+    found = bounds_from_recording(model, [each[1:] for each in rows], [each[:1] for each in rows], E, sensor=0.001)
+    assert made.disturbance.parts[0].set.half == pytest.approx(2 * found.explaining)
+
+
+def test_sensors_and_a_record_are_given(files):
     folder, _ = files
+    missing = ncs("bounds", folder / "none.csv", "--plant", folder / "p.json")
+    assert_one_sentence(missing, f"cannot read the record in {folder / 'none.csv'}: No such file or directory")
     known = succeeded("bounds", folder / "record.csv", "--plant", folder / "p.json", "--sensor", 0.002, 0.003).prose
     assert "within position 0.002, y2 0.003." in known
 

@@ -5,7 +5,7 @@ import pytest
 
 from ncs_gym import Channel, ChannelContract, truck_trailer
 from ncs_gym.estimation.error_bound import certified_error_set
-from shields import Infeasible, verify
+from shields import Infeasible, reach_of, verify
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from tests.certificates import certificate_of, feasible_age_not_sought
 from tests.plants import NAMED, named, random_plant
@@ -215,3 +215,40 @@ def test_synthesis_gives_what_tests_have_checked_in(name):
     assert made.keeps_ellipsoid == kept.keeps_ellipsoid
     for share in ("volume_of_box_ellipsoid", "share_of_box", "polytope_share_of_box"):  # with delays not the second
         assert made.provenance.get(share) == pytest.approx(kept.provenance.get(share), abs=2e-3)
+
+
+def test_delayed_inputs_are_the_registers_that_one_writes_by_hand_and_cost_no_search_for_an_ellipsoid():
+    """A heat exchanger, whose valve acts seven steps later: registers in order, the oldest first, with wide limits."""
+    a, b, d = 0.906112734834199, 0.09388726516580104, 7
+    late = linear_plant(
+        A=[[a]], B=[[b]], dt=2.1, input_delay=d, box=[0.5], u_max=1.0, disturbance_bound=[0.004], sensor_bound=[0.01],
+        initial_bound=[0.02],
+    )  # fmt: skip
+    A, B, own = np.diag(np.ones(d), 1), np.eye(d + 1)[:, d:], np.zeros(d)
+    A[0, :2] = a, b
+    by_hand = linear_plant(
+        A=A, B=B, H=np.eye(1, d + 1), dt=2.1, box=[0.5, *np.full(d, 4.0)], u_max=1.0,
+        disturbance_bound=[0.004, *own], sensor_bound=[0.01], initial_bound=[0.02, *own],
+    )  # fmt: skip
+    assert late.fingerprint == by_hand.fingerprint
+    stages = []
+    certificate = synthesize(late, contract=ChannelContract(3), progress=stages.append)
+    assert verified(certificate, by_hand).valid
+    assert certificate.provenance["polytope_share_of_box"] > 0.999
+    assert not any("alternation" in each for each in stages)
+
+
+@pytest.mark.slow
+def test_a_column_of_lags_with_dead_times_has_a_certificate_up_to_its_limits():
+    """Wood and Berry's column: four lags, whose dead times are those of no input and of no output alone."""
+    C = [[1, 1, 0, 0], [0, 0, 1, 1]]
+    gain, lag, dead = [12.8, -18.9, 6.6, -19.4], np.array([16.7, 21.0, 10.9, 14.4]), [[1, 0], [0, 3], [7, 0], [0, 3]]
+    plant = sampled_plant(
+        (np.diag(-1.0 / lag), [[1, 0], [0, 1], [1, 0], [0, 1]] * (gain / lag)[:, None], C, 0),
+        1.0, input_delay=dead, box=[3.0] * 4, u_max=[0.15, 0.15],
+        output_limits=[(each, -1.0, 1.0) for each in C],
+        disturbance_bound=[0.005] * 4, sensor_bound=[0.01] * 2, initial_bound=[0.01] * 4,
+    )  # fmt: skip
+    certificate = synthesize(plant, contract=ChannelContract(2))
+    assert (plant.n, plant.past) == (18, 14)
+    assert min(each.low for each in reach_of(certificate, plant)) > 99.0
