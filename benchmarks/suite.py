@@ -427,9 +427,11 @@ def differences_table(found: dict[str, Any]) -> str:
             both = [each for each in blocks.values() if first in each and second in each]
             if not both:
                 continue
-            values = [
-                scale * (_of(each[first], column, scenario) - _of(each[second], column, scenario)) for each in both
-            ]
+            values = []
+            for each in both:  # runs of the same number have the same seeds; policies that need no training have fewer
+                one, other = (_of(each[name], column, scenario) for name in (first, second))
+                runs = min(len(one), len(other))
+                values.append(scale * (one[:runs] - other[:runs]))
             every = np.concatenate(values)
             mean, half = float(np.mean(every)), float(t.ppf(0.975, len(every) - 1) * sem(every))
             means = " ".join(f"{np.mean(each):+z.1f}" for each in values)
