@@ -39,7 +39,7 @@ _CYCLES = (1, 2, 4, 8, 16, 32)
 _SIDES = {"low": -np.inf, "high": np.inf}
 # Plants whose filters are attacked in C: limits of two ends, free states, unstable ones, outputs and registers.
 _ON_BOARDS = (
-    *("ctms_cruise", "fbs_cruise", "ctms_motor_pos", "quad_tank_min", "lane_keeping", "acc_mathworks"),
+    *("ctms_cruise", "fbs_cruise", "ctms_motor_pos", "lane_keeping", "acc_mathworks"),
     *("cstr_pcgym", "ampyc_sf", "boost", "bicycle", "heat_exchanger"),
 )
 # An episode of such an attack takes so many steps; another row of the safe set is aimed at every so many.
@@ -241,7 +241,7 @@ def _attacked_board(
     assert polytope is not None
     memory = ctypes.create_string_buffer(8 * (2 * n + (h + 1) * m) + 64)
     reason = np.frombuffer(memory, np.int32)[2 * (2 * n + (h + 1) * m) + 5 :]  # after five counters
-    u, found = np.zeros(m), [0, 0, 0.0]
+    u, guaranteed, outside, farthest, oldest, mixes = np.zeros(m), 0, 0, 0.0, 0, False
     noises = plant.nominal_disturbance, plant.nominal_sensor_error
 
     def at(numbers: np.ndarray) -> ctypes.c_void_p:
@@ -254,7 +254,7 @@ def _attacked_board(
         taken: list[np.ndarray] = []
         for step in range(_EPISODE):
             if step % _PATIENCE == 0:
-                oldest, mixes = int(rng.integers(h + 1)), rng.random() < 0.5
+                oldest, mixes = int(rng.integers(h + 1)), bool(rng.random() < 0.5)
             f = polytope.F[(polytope.F @ (plant.A @ x + plant.B @ u - polytope.center)).argmax()]
             d, v = (_pushed(each, row, rng) for each, row in zip(noises, (f, -plant.H @ f), strict=True))
             taken.append(plant.H @ x + v)
@@ -265,10 +265,10 @@ def _attacked_board(
             proposed = rng.choice([outwards, rng.uniform(1.5 * plant.input_low, 1.5 * plant.input_high), np.nan * u])
             c.ncs_decide(memory, at(proposed), at(u))
             if reason[0] == GUARANTEED:
-                outside = polytope.gauge(x) > 1.0 + 1e-9 or plant.constraint_values(x).max() > 1e-9
-                found = [found[0] + 1, found[1] + outside, max(found[2], polytope.gauge(x))]
+                guaranteed, farthest = guaranteed + 1, max(farthest, float(polytope.gauge(x)))
+                outside += int(polytope.gauge(x) > 1.0 + 1e-9 or plant.constraint_values(x).max() > 1e-9)
             x = plant.A @ x + plant.B @ u + d
-    return found[0], found[1], found[2]
+    return guaranteed, outside, farthest
 
 
 def _pushed(noise: Ellipsoid, row: np.ndarray, rng: np.random.Generator) -> np.ndarray:
