@@ -284,7 +284,7 @@ def test_published_plant_is_accepted_as_its_authors_write_it(name):
     plant, p = plant_of(name), published()[name]
     published_ends = np.array([p["input_low"], p["input_high"]])
     np.testing.assert_allclose(plant.input_ends + plant.operating_input, published_ends, rtol=1e-9, atol=1e-9)
-    limited = [i for i in range(plant.n) if p["state_low"][i] is not None or p["state_high"][i] is not None]
+    limited = [i for i in range(len(p["state_low"])) if p["state_low"][i] is not None or p["state_high"][i] is not None]
     for j, i in enumerate(limited):
         low, high = plant.box_ends[:, j] / plant.box[j, i] + plant.operating_state[i]
         for end, given in ((low, p["state_low"][i]), (high, p["state_high"][i])):

@@ -120,14 +120,6 @@ def test_echoes_of_another_episode_are_a_reason_of_their_own_while_they_come():
     assert reasons == [""] * 15 + [OTHER_EPISODE] * 10 + [NOT_CONFIRMED] * 6 + [""] * 9
 
 
-def test_what_the_loop_says_is_conditional_where_nothing_is_echoed():
-    told, untold = loop_with(), loop_with(echo_age=None)
-    for loop in (told, untold):
-        loop.start(np.zeros(4))
-    condition = "if everything that is decided is applied"
-    assert (condition in str(told), condition in str(untold)) == (False, True)
-
-
 @pytest.mark.parametrize("input_delay", [0, 2, 5])
 def test_wild_stamps_and_inputs_do_not_stop_an_actuator(input_delay):
     actuator = Actuator(input_delay, 1, 10.0)
