@@ -35,7 +35,7 @@ COMMANDS = {
     "synthesize": "Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.",
     "verify": "Verifies a certificate in exact rational arithmetic against the plant it was made for.",
     "export-c": "Writes a safety filter in C99 for a board, with test vectors that check it.",
-    "bounds": "Says what bounds of a plant's disturbances a record of it proves, and writes the plant with such bounds.",
+    "bounds": "Says what bounds of a plant's disturbances a record of it proves, and writes a plant with them.",
     "channel": "Reads recorded packets, and says how often each channel contract would have been broken.",
     "requirements": "Finds how old and how coarse the samples of a plant may be, so that it is certifiable.",
     "attack": "Attacks shielded loops with worst-case disturbances and agents, and counts states outside.",

@@ -19,7 +19,7 @@ from ncs_gym.validation import counted, shown
 
 @dataclass(frozen=True, kw_only=True)
 class BoundsSettings:
-    """Says what bounds of a plant's disturbances a record of it proves, and writes the plant with such bounds.
+    """Says what bounds of a plant's disturbances a record of it proves, and writes a plant with them.
 
     Attributes:
         file: A table (CSV, or Parquet where pyarrow is installed) with the plant's inputs and outputs by name as
