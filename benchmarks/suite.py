@@ -174,7 +174,7 @@ def pages(root: Path = ROOT) -> None:
     for name, png in suite_figures(found).items():
         (file.parent / "images" / f"results-{name}.png").write_bytes(png)
     page = root / PAGE
-    page.write_text(quoted(page.read_text("utf-8"), {name: table(found) for name, table in TABLES.items()}), "utf-8")
+    page.write_text(quoted(page.read_text("utf-8"), quotable(found)), "utf-8")
 
 
 def quoted(page: str, tables: Mapping[str, str]) -> str:
@@ -420,9 +420,9 @@ def differences_table(found: dict[str, Any]) -> str:
         ("return", AS_TRAINED, 1.0, "shielded", "shield at test"),
         ("return", AS_TRAINED, 1.0, "lqr:observer+shielded", "shielded"),
     )
-    rows = [["", "", "first less second", ""], ["", "of", "by block", "interval"]]
+    rows = [["first less second", "by block", "interval"]]
     for column, scenario, scale, first, second in pairs:
-        rows.append([f"{first} - {second}"])
+        rows.append([f"{first} - {second}: {column}, {scenario}" + (" [points]" if scale > 1.0 else "")])
         for task, blocks in found["tasks"].items():
             both = [each for each in blocks.values() if first in each and second in each]
             if not both:
@@ -433,11 +433,12 @@ def differences_table(found: dict[str, Any]) -> str:
                 runs = min(len(one), len(other))
                 values.append(scale * (one[:runs] - other[:runs]))
             every = np.concatenate(values)
+            if not every.any():
+                continue  # nothing happens there
             mean, half = float(np.mean(every)), float(t.ppf(0.975, len(every) - 1) * sem(every))
             means = " ".join(f"{np.mean(each):+z.1f}" for each in values)
-            title = f"{column}, {scenario}" + (" [points]" if scale > 1.0 else "")
-            rows.append([f"  {task}", title, means, _shown((mean - half, mean + half))])
-    return text_table(rows, rules=(2,))
+            rows.append([f"  {task}", means, _shown((mean - half, mean + half))])
+    return text_table(rows, rules=(1,))
 
 
 def impairments_table(found: dict[str, Any]) -> str:
@@ -505,10 +506,14 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
 }
 
 
+def quotable(found: dict[str, Any]) -> dict[str, str]:
+    """Returns the tables by name; of a task that was not measured there is none."""
+    return {name: table(found) for name, table in TABLES.items() if name not in TASKS or name in found["tasks"]}
+
+
 def all_tables(found: dict[str, Any]) -> str:
     """Returns all tables as plain text."""
-    shown = [name for name in TABLES if name not in TASKS or name in found["tasks"]]
-    return "\n\n\n".join(f"{name}\n{TABLES[name](found)}" for name in shown) + "\n"
+    return "\n\n\n".join(f"{name}\n{table}" for name, table in quotable(found).items()) + "\n"
 
 
 COMMANDS = (measure, replicate, pages)

@@ -43,7 +43,7 @@ def _rows(
     draw: Callable[[Axes, ArmStyle, list[dict[str, Any]], int], None],
 ) -> CaptionedFigure:
     """Returns a quantity of some rows, a panel per task and a marker per block."""
-    styles, columns = arm_styles(list(names)), min(len(tasks), 4)
+    styles, columns = arm_styles(list(names)), min(len(tasks), 3)
     lines = -(-len(tasks) // columns)
     with matplotlib.rc_context(STYLE):
         figure = CaptionedFigure((1.7 + _PANEL * columns, lines * (_TITLES + _ROW * len(names))))
@@ -75,7 +75,7 @@ def _draw_attacked(axis: Axes, style: ArmStyle, blocks: list[dict[str, Any]], he
 
 def _draw(axis: Axes, style: ArmStyle, blocks: list[np.ndarray], height: int) -> None:
     """Draws the means of blocks above each other, and small the runs of all."""
-    for runs, shift in zip(blocks, (0.14, -0.14), strict=False):
+    for runs, shift in zip(blocks, (0.14, -0.14) if len(blocks) > 1 else (0.0,), strict=False):
         axis.plot(runs, [height + shift] * len(runs), "o", ms=2.5, color=style.color, alpha=0.35, mew=0.0)
         axis.plot(np.mean(runs), height + shift, "o", ms=6.0, mfc=style.color, mec="white", mew=0.6, zorder=4)
 

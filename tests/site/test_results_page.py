@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from benchmarks.suite import NUMBERS, PAGE, ROOT, TABLES, all_tables, quoted
+from benchmarks.suite import NUMBERS, PAGE, ROOT, all_tables, quotable, quoted
 
 
 @pytest.fixture(scope="module")
@@ -13,7 +13,7 @@ def stored():
 
 
 def test_quoted_tables_are_those_of_the_stored_benchmark(stored):
-    text, tables = (ROOT / PAGE).read_text(), {name: table(stored) for name, table in TABLES.items()}
+    text, tables = (ROOT / PAGE).read_text(), quotable(stored)
     assert quoted(text, tables) == text
     altered = text.replace("-->\n```\n", "-->\n```\nanother figure\n")
     assert altered != text == quoted(altered, tables)
