@@ -347,7 +347,7 @@ def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> Captioned
         left.set_xticks([0, 10, 100, 1000, 10000], ["0", "10", "100", "1,000", "10,000"])
         left.xaxis.set_minor_locator(NullLocator())
         left.set_title(env, loc="left")
-        claimed.set_xlim(96.9, 100.15)
+        claimed.set_xlim(94.8, 100.2)
         for row, (name, networks) in enumerate(filters.items()):
             for offset, (network, each) in zip((-0.22, 0.0, 0.22), networks.items(), strict=True):
                 color, marker = MARKS[network]
@@ -356,7 +356,7 @@ def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> Captioned
                 if name in CLAIMING:
                     claimed.plot(100.0 * each.ever, row + offset, **given)
     axes[-1][0].set_xlabel("ends of episodes per hour")
-    axes[-1][1].set_xlabel("steps at which the guarantee holds [%]")
+    axes[-1][1].set_xlabel("steps with a claim [%]")
     legend_below(drawn, handles)
     return drawn
 
