@@ -34,8 +34,9 @@ certificate = synthesize(plant, contract=contract)
 print(plant)
 print(certificate)
 
-env = gym.make("ncs_gym/LinearNCS-v0", plant=plant, channel=channel, contract=contract, max_episode_steps=400)
-for name, loop in (("without a shield", env), ("with a shield", SafetyShield(env, certificate))):
+settings = {"plant": plant, "channel": channel, "contract": contract, "max_episode_steps": 400}
+bare, other = (gym.make("ncs_gym/LinearNCS-v0", **settings) for _ in range(2))  # a shield guards the one it is given
+for name, loop in (("without a shield", bare), ("with a shield", SafetyShield(other, certificate))):
     loop.reset(seed=0)
     violations, lowest, highest = 0, np.full(4, np.inf), np.full(4, -np.inf)
     for step in range(400):
