@@ -34,8 +34,10 @@ from experiments.terminal import text_table
 from ncs_gym import Channel, ChannelContract
 
 ROOT = Path(__file__).resolve().parents[1]
-# Where the numbers are kept, and the page that shows them.
-NUMBERS, PAGE = Path("docs/results.json"), Path("docs/benchmark.md")
+# Where numbers are kept as they come, those that the page shows, and the page.
+MEASURED, NUMBERS, PAGE = Path("runs/suite/numbers.json"), Path("docs/results.json"), Path("docs/benchmark.md")
+# Runs of a primary arm and block, steps of a training, and episodes of a run in each scenario.
+SEEDS, STEPS, EPISODES = 10, 60_000, 25
 # Tasks in which the network decides, and others.
 NETWORK_TASKS = ("CSTR-v0", "Convoy-v0", "LaneKeeping-v0")
 OTHER_TASKS = ("TruckTrailerCruise-v0", "TruckTrailer-v0", "BatchReactor-v0", "CartPole-v0")
@@ -101,42 +103,48 @@ CURVE_POINTS = 16
 
 # Impairments of a channel; a rate is a sample every second step. Rows that are attacked with each of them.
 SWITCHES, SLOW = ("loss", "delay", "rate", "rounding"), 2
-SWITCHED, SWITCHED_RUNS = ("unshielded", "trusting:20", "shielded"), 5
+SWITCHED = ("unshielded", "trusting:20", "shielded")
+# So few runs of them play so few episodes with each.
+SWITCHED_RUNS, SWITCHED_EPISODES = 5, 3
 
 
 def measure(
     tasks: Annotated[Sequence[str], some_of(TASKS)] = TASKS,
     arms: Annotated[Sequence[str], some_of(tuple(ENTRIES))] = tuple(ENTRIES),
     blocks: Sequence[int] = (0, 1),
-    seeds: int = 10,
-    steps: int = 60_000,
-    episodes: int = 25,
-    impairments: bool = True,
+    seeds: int = SEEDS,
+    steps: int = STEPS,
+    episodes: int = EPISODES,
     jobs: int = 2,
-    out: Path = Path("runs/suite"),
-    numbers: Path = NUMBERS,
+    out: Path = MEASURED.parent,
+    numbers: Path = MEASURED,
 ) -> None:
-    """Trains and judges arms on tasks, and keeps the numbers that the page shows.
+    """Trains and judges arms on tasks, and keeps the numbers; `pages` puts them into the page.
 
     A block is a seed of the whole experiment: of its --seeds trainings of an arm, and of the --episodes that each agent
-    is judged on per scenario. Finished runs in --out are kept: started again, the suite goes on. Tasks that --numbers
-    has and --tasks has not stay there.
+    is judged on per scenario. Finished runs in --out are kept: started again, the suite goes on. Rows that --numbers
+    has and that are not asked for stay there.
+
+    Raises:
+        ValueError: If --numbers has numbers of other blocks, runs, steps or episodes.
     """
-    known = json.loads(numbers.read_text("utf-8")) if numbers.exists() else {}
-    known = known if known.get("budget") == (budget := [list(blocks), seeds, steps, episodes]) else {}
-    found = {"budget": budget, "versions": versions()} | {key: known.get(key, {}) for key in ("tasks", "impairments")}
+    budget = [list(blocks), seeds, steps, episodes]
+    found: dict[str, Any] = json.loads(numbers.read_text("utf-8")) if numbers.exists() else {"budget": budget}
+    if found["budget"] != budget:
+        raise ValueError(
+            f"{numbers} has other blocks, runs, steps or episodes, {found['budget']}: give other --numbers"
+        )
+    found = {"tasks": {}, "impairments": {}} | found | {"versions": versions()}
     for task in tasks:
-        names = [name for name in rows_of(task) if name in arms]
-        of_task = {}
         for block in blocks:
             settings = _settings(task, block, seeds, steps, episodes, jobs, out)
-            chosen = [name for name in names if name in PRIMARY or block == blocks[0]]
-            switching = (
-                [arm for arm in SWITCHED if arm in names] if task in NETWORK_TASKS and block == blocks[0] else []
-            )
-            of_task[str(block)], switched_off = _block(settings, chosen, switching if impairments else [])
-            found["impairments"] |= {task: switched_off} if switched_off else {}
-        found["tasks"][task] = of_task
+            names = [each for each in rows_of(task) if each in arms and (each in PRIMARY or block == blocks[0])]
+            rows = found["tasks"].setdefault(task, {}).setdefault(str(block), {})
+            rows |= _block(settings, names)
+            if task in NETWORK_TASKS and block == blocks[0]:
+                switching = [each for each in SWITCHED if each in names]
+                found["impairments"][task] = found["impairments"].get(task, {}) | _impairments(settings, switching)
+        numbers.parent.mkdir(parents=True, exist_ok=True)
         numbers.write_text(json.dumps(found, allow_nan=False) + "\n", "utf-8")
     print(all_tables(found))
 
@@ -145,7 +153,7 @@ def replicate(
     tasks: Annotated[Sequence[str], some_of(TASKS)] = NETWORK_TASKS,
     block: int = 2,
     jobs: int = 2,
-    out: Path = Path("runs/suite"),
+    out: Path = MEASURED.parent,
     numbers: Path = NUMBERS,
 ) -> None:
     """Runs another block of the primary arms, and counts its numbers inside the printed intervals."""
@@ -154,7 +162,7 @@ def replicate(
     inside, rows = [], [["outside", "printed", "block"]]
     for task in tasks:
         names = [name for name in PRIMARY if name in found["tasks"][task]["0"]]
-        again, _ = _block(_settings(task, block, seeds, steps, episodes, jobs, out), names)
+        again = _block(_settings(task, block, seeds, steps, episodes, jobs, out), names)
         for name in names:
             for column, scenario in _JUDGED:
                 printed = _interval([each[name] for each in found["tasks"][task].values()], column, scenario)
@@ -166,10 +174,11 @@ def replicate(
     print(text_table(rows) if rows[1:] else "")
 
 
-def pages(root: Path = ROOT) -> None:
-    """Writes tables and figures of the stored numbers into the pages of a clone."""
-    file = root / NUMBERS
-    found = json.loads(file.read_text("utf-8"))
+def pages(numbers: Path = MEASURED, root: Path = ROOT) -> None:
+    """Writes numbers, tables and figures into the pages of a clone; `--numbers docs/results.json` are those it has."""
+    file, found = root / NUMBERS, json.loads(numbers.read_text("utf-8"))
+    found["tasks"] = {task: found["tasks"][task] for task in TASKS if task in found["tasks"]}
+    file.write_text(json.dumps(found, allow_nan=False) + "\n", "utf-8")
     file.with_suffix(".txt").write_text(all_tables(found), "utf-8")
     for name, png in suite_figures(found).items():
         (file.parent / "images" / f"results-{name}.png").write_bytes(png)
@@ -197,11 +206,11 @@ def row_of(
 
     Args:
         task: One of `TASKS`.
-        policy: Makes what acts in a run, given the control loop and a seed.
+        policy: Makes what acts in a run, given the control loop and the number of the run.
         behind: Arm of `ncs compare` that names a filter: "shielded", "trusting:20", or "unshielded" for none.
         block: The block.
     """
-    settings = _settings(task, block, 10, 1, 25, 1, Path())
+    settings = _settings(task, block, SEEDS, 1, EPISODES, 1, Path())
     loop = loop_config(settings.env)
     certificate, results = certificate_of(loop, None, settings.safe_set), []
     for index in range(settings.seeds):
@@ -210,9 +219,8 @@ def row_of(
             each: evaluate(under(each, own.loop), policy(own.loop, index), own.episodes, own.evaluation_seed).episodes
             for each in (AS_TRAINED, *SCENARIOS)
         }
-        result = RunResult(arm=behind, index=index, train_steps=0, train_violation_steps=0, train_interventions=0,
-                           history=[], episodes=played.pop(AS_TRAINED), scenarios=played)  # fmt: skip
-        results.append(result)
+        nothing = {"train_steps": 0, "train_violation_steps": 0, "train_interventions": 0, "history": []}
+        results.append(RunResult(behind, index, **nothing, episodes=played.pop(AS_TRAINED), scenarios=played))
     return _numbers(results)
 
 
@@ -230,67 +238,48 @@ def _settings(task: str, block: int, seeds: int, steps: int, episodes: int, jobs
     )
 
 
-def _block(
-    settings: CompareSettings, names: Sequence[str], switching: Sequence[str] = ()
-) -> tuple[dict[str, Any], dict[str, dict[str, float]]]:
-    """Returns the numbers of rows in a block, and shares of violating episodes with impairments on and off.
-
-    First agents are trained, then they act behind other filters and on other channels.
-
-    Args:
-        settings: Of the block.
-        names: Of the rows.
-        switching: Arms that are attacked with no, each alone and all of `SWITCHES` on, few runs of each, in a tenth
-            of their episodes.
-    """
+def _block(settings: CompareSettings, names: Sequence[str]) -> dict[str, Any]:
+    """Returns the numbers of rows in a block: agents are trained, then they act behind other filters too."""
     loop = loop_config(settings.env)
     certificate = certificate_of(loop, None, settings.safe_set)
 
-    def runs_of(name: str, arm: str) -> list[TrainingRun]:
-        entry = ENTRIES[name]
-        runs = [run_of_arm(settings, loop, certificate, arm, index) for index in range(settings.seeds)][: entry.seeds]
-        if entry.attacked:
-            runs = [replace(each, training_loop=under(ATTACKED, each.training_loop)) for each in runs]
-        return [replace(each, grid_point="attacked" if entry.attacked else "") for each in runs]
-
-    first = {name: runs_of(name, ENTRIES[name].arm) for name in names if not ENTRIES[name].tested}
-    tested = {name: ENTRIES[name].arm for name in names if ENTRIES[name].tested}
-    first |= {arm: runs_of(arm, arm) for arm in tested.values() if arm not in first}
-    runs = sorted((each for own in first.values() for each in own), key=lambda each: each.index)
-    results = {each.name: result for each, result in zip(runs, results_of(runs, settings.out, settings), strict=True)}
-    numbers = {name: _numbers([results[each.name] for each in own]) for name, own in first.items()}
-
-    def with_agent(own: TrainingRun, trained: TrainingRun) -> TrainingRun:
-        folder = settings.out / "models" / trained.name
-        return replace(own, agent_files={each: (folder / each).read_bytes() for each in AGENT_FILES})
-
-    others = {
-        name: [
-            with_agent(replace(own, grid_point="tested"), trained)
-            for own, trained in zip(runs_of(name, ENTRIES[name].tested), first[arm], strict=True)
+    def runs_of(entry: Entry, arm: str, point: str = "") -> list[TrainingRun]:
+        count = min(settings.seeds, entry.seeds or settings.seeds)
+        runs = [run_of_arm(settings, loop, certificate, arm, index, point) for index in range(count)]
+        if not entry.attacked:
+            return runs
+        return [
+            replace(each, grid_point="attacked", training_loop=under(ATTACKED, each.training_loop)) for each in runs
         ]
-        for name, arm in tested.items()
+
+    tested = {name: ENTRIES[name] for name in names if ENTRIES[name].tested}
+    trained = dict.fromkeys([*(name for name in names if name not in tested), *(each.arm for each in tested.values())])
+    first = {name: runs_of(ENTRIES[name], ENTRIES[name].arm) for name in trained}
+    numbers = _judged(first, settings)
+    second = {
+        name: [
+            _with_agent(run, settings, agent)
+            for run, agent in zip(runs_of(entry, entry.tested, "tested"), first[entry.arm], strict=True)
+        ]
+        for name, entry in tested.items()
     }
-    env, few = registered_env(settings.env), replace(settings, episodes=-(-settings.episodes // 10))
-    for title, on in {"none": (), **{each: (each,) for each in SWITCHES}, "all": SWITCHES}.items() if switching else ():
-        changed = loop_config(settings.env, switched(env.channel, env.contract, on))
-        own_certificate = certificate_of(changed, None, settings.safe_set)
-        for arm in switching:
-            own = [
-                run_of_arm(few, changed, own_certificate, arm, i, title)
-                for i in range(min(settings.seeds, SWITCHED_RUNS))
-            ]
-            pairs = zip(own, first[arm], strict=False)
-            others[f"{title}/{arm}"] = [with_agent(each, it) if it.trains else each for each, it in pairs]
-    second = results_of([each for own in others.values() for each in own], settings.out, settings) if others else []
-    found = {name: [second.pop(0) for _ in own] for name, own in others.items()}
-    for name, arm in tested.items():
-        numbers[name] = _numbers(found.pop(name)) | {key: numbers[arm][key] for key in ("training", "curve")}
-    shares: dict[str, dict[str, float]] = {arm: {} for arm in switching}
-    for key, played in found.items():
-        title, arm = key.split("/")
-        shares[arm][title] = float(np.mean(_numbers(played)["scenarios"][ATTACKED]["violating"]))
-    return {name: numbers[name] for name in names}, shares
+    for name, found in _judged(second, settings).items():
+        numbers[name] = found | {key: numbers[tested[name].arm][key] for key in ("training", "curve")}
+    return {name: numbers[name] for name in names}
+
+
+def _judged(runs: Mapping[Any, Sequence[TrainingRun]], settings: CompareSettings) -> dict[Any, dict[str, Any]]:
+    """Returns the numbers of runs by the key of each, executed in the order of their indices."""
+    every = sorted((each for own in runs.values() for each in own), key=lambda each: each.index)
+    found = results_of(every, settings.out, settings) if every else []
+    results = {each.name: result for each, result in zip(every, found, strict=True)}
+    return {key: _numbers([results[each.name] for each in own]) for key, own in runs.items()}
+
+
+def _with_agent(run: TrainingRun, settings: CompareSettings, trained: TrainingRun) -> TrainingRun:
+    """Returns a run in which the agent acts that another one has trained."""
+    folder = settings.out / "models" / trained.name
+    return replace(run, agent_files={each: (folder / each).read_bytes() for each in AGENT_FILES})
 
 
 def _numbers(results: Sequence[RunResult]) -> dict[str, Any]:
@@ -343,6 +332,32 @@ def switched(channel: Channel, contract: ChannelContract | None, on: Sequence[st
         most = channel.max_consecutive_losses
         changes["max_consecutive_losses"] = room if most is None else min(room, most)
     return changes
+
+
+def _impairments(settings: CompareSettings, arms: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Returns the share of attacked episodes that violate with no, each alone and all of `SWITCHES` on, by arm.
+
+    Agents are those of the block, trained with all of the task's own impairments.
+    """
+    env, few = registered_env(settings.env), replace(settings, episodes=SWITCHED_EPISODES)
+    own = loop_config(settings.env)
+    trained_behind, runs = certificate_of(own, None, settings.safe_set), {}
+    for title, on in {"none": (), **{each: (each,) for each in SWITCHES}, "all": SWITCHES}.items():
+        loop = loop_config(settings.env, switched(env.channel, env.contract, on))
+        certificate = certificate_of(loop, None, settings.safe_set)
+        for arm in arms:
+            runs[arm, title] = [
+                _with_agent(
+                    run_of_arm(few, loop, certificate, arm, index, title),
+                    settings,
+                    run_of_arm(settings, own, trained_behind, arm, index),
+                )
+                for index in range(min(settings.seeds, SWITCHED_RUNS))
+            ]
+    shares: dict[str, dict[str, float]] = {arm: {} for arm in arms}
+    for (arm, title), numbers in _judged(runs, settings).items():
+        shares[arm][title] = float(np.mean(numbers["scenarios"][ATTACKED]["violating"]))
+    return shares
 
 
 # Columns that a block is judged by, in their scenarios.

@@ -134,15 +134,16 @@ def test_every_impairment_keeps_the_contract_and_has_what_is_on(task):
 
 @pytest.mark.slow
 def test_a_small_suite_keeps_its_runs_trains_once_and_nothing_breaks_the_shield(tmp_path):
-    def made(**changed):
-        names = ("unshielded", "shielded", "shield at test", "unshielded, attacked", "lqr", "lqr:observer+shielded")
+    def made(*names, **changed):
         settings = {"tasks": NETWORK_TASKS[:1], "arms": names, "seeds": 2, "steps": 1500, "episodes": 40}
-        suite.measure(**settings | changed, jobs=1, out=tmp_path / "out", numbers=tmp_path / "results.json")
-        return json.loads((tmp_path / "results.json").read_text())
+        suite.measure(**settings | changed, jobs=1, out=tmp_path / "out", numbers=tmp_path / "numbers.json")
+        return json.loads((tmp_path / "numbers.json").read_text())
 
     with no_worker_processes():
-        found = made()
-        assert made() == found  # finished runs are kept
+        found = made("unshielded", "shielded", "shield at test", "unshielded, attacked", "lqr:observer+shielded")
+        assert made("unshielded", "shield at test") == found  # finished runs are kept, and other rows stay
+        with pytest.raises(ValueError, match="has other blocks, runs, steps or episodes"):
+            made("unshielded", steps=1600)
     first, second = found["tasks"]["CSTR-v0"].values()
     assert set(second) == {"unshielded", "shielded", "shield at test"}
     assert first["unshielded"]["curve"] == first["shield at test"]["curve"]  # the same agents
@@ -154,6 +155,18 @@ def test_a_small_suite_keeps_its_runs_trains_once_and_nothing_breaks_the_shield(
     assert list(shares["unshielded"]) == ["none", *SWITCHES, "all"]
     assert set(shares["shielded"].values()) == {0.0}
     assert all(len(each) == 2 for each in (first["unshielded"]["training"], second["unshielded"]["training"]))
+
+
+def test_pages_show_what_was_measured_in_the_order_of_the_tasks(found, tmp_path):
+    (tmp_path / "docs" / "images").mkdir(parents=True)
+    page, numbers = tmp_path / suite.PAGE, tmp_path / "numbers.json"
+    page.write_text("<!-- suite: budget -->\n<!-- end -->\n")
+    numbers.write_text(json.dumps(found | {"tasks": dict(reversed(found["tasks"].items()))}))
+    suite.pages(numbers, tmp_path)
+    assert "2 blocks of 3 runs per primary arm, 1,000 training steps each" in page.read_text()
+    assert list(json.loads((tmp_path / suite.NUMBERS).read_text())["tasks"]) == ["Convoy-v0", "BatchReactor-v0"]
+    assert (tmp_path / suite.NUMBERS).with_suffix(".txt").read_text() == all_tables(found)
+    assert len(list((tmp_path / "docs" / "images").glob("results-*.png"))) == 3
 
 
 def test_policy_of_ones_own_has_a_row_on_the_same_episodes(monkeypatch):
