@@ -59,7 +59,7 @@ def unasked(tmp_path, monkeypatch):
     return plant, replace(certificate, fingerprint=plant.fingerprint), tmp_path / "own.json"
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(4)
 @pytest.mark.parametrize("env_id", IDS)
 def test_every_id_has_a_verified_certificate(env_id):
     plant, contract = plant_and_contract(env_id)

@@ -80,7 +80,7 @@ def campaign() -> list:
     return rows
 
 
-@pytest.mark.cases(12)
+@pytest.mark.cases(24)
 @pytest.mark.parametrize(("name", "mode", "through", "is_whole"), campaign())
 def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
     first = [*CASES].index(name) + MODES.index(mode)
@@ -104,7 +104,7 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
         assert counts["guaranteed"] > 0.3 * counts["steps"]
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(5)
 @pytest.mark.parametrize(("count", "steps"), [(30, 50), pytest.param(200, 500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, count, steps):
@@ -138,7 +138,7 @@ def test_errors_that_came_back_into_certified_sets_stay_there_while_the_contract
     assert min(outcome.counts["lost"], outcome.counts["certified again"]) > 0
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(4)
 @pytest.mark.parametrize(
     ("name", "seed"),
     [
@@ -281,7 +281,7 @@ def twins() -> list:
     ]
 
 
-@pytest.mark.cases(9)
+@pytest.mark.cases(14)
 @pytest.mark.parametrize(("defect", "name", "mode", "through"), twins())
 def test_the_adversary_catches(defect, name, mode, through, monkeypatch):
     claims, _, anyway, _ = TWINS[defect]
@@ -299,7 +299,7 @@ def test_sensor_noise_larger_than_assumed_takes_errors_out_of_their_ellipsoids(n
     assert outcome.ever[ERROR] > 1.0
 
 
-@pytest.mark.cases(1)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 @pytest.mark.parametrize("name", ["cart-pole", "batch reactor"])
 def test_broken_contract_ends_the_guarantee_before_anything_is_left(name, mode):
@@ -309,7 +309,7 @@ def test_broken_contract_ends_the_guarantee_before_anything_is_left(name, mode):
     assert 0 < outcome.counts["guaranteed"] < outcome.counts["steps"]
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize("mode", ["project", "lookahead"])
 @pytest.mark.parametrize("env_id", ["TruckTrailerCruise", "CartPole", "BatchReactor"])
 def test_registered_environments_are_shielded_as_they_come(env_id, mode):

@@ -79,7 +79,6 @@ def certified(name, plant=None):
     return certificate_of(plant or make(), settings.get("contract"), safe_set)
 
 
-@pytest.mark.cases(3)
 @pytest.mark.parametrize(("count", "steps"), SIZES)
 @pytest.mark.parametrize("mode", ["project", "boundary", "lookahead"])
 @pytest.mark.parametrize("name", FAMILIES)
@@ -103,7 +102,6 @@ def test_certificate_of_the_middle_alone_does_not_hold_and_that_is_seen(name):
     assert name != "truck" or counts["unsafe"] > 100
 
 
-@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", FAMILIES)
 def test_both_verifiers_agree_and_refuse_the_certificate_of_the_middle(name):
     family = FAMILIES[name][0]()
@@ -198,7 +196,7 @@ def varying_tank():
     return family_of(tank, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("every", [1, 10])
 @pytest.mark.parametrize("outward", [-1.0, 1.0])
 @pytest.mark.parametrize("k", [0.19, 0.2, 0.21])

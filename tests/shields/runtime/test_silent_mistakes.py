@@ -13,9 +13,12 @@ from ncs_gym import Channel, Packet, RequestActions, VectorNetworked, VectorRequ
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from tests.certificates import certificate_of
 from tests.product import (
+    linear_plant,
     loop_env,
     safe_loop,
+    safety_filter,
     safety_shield,
+    synthesize,
     vector_env,
     vector_shield,
 )
@@ -104,3 +107,17 @@ def test_copy_of_a_loop_shares_nothing_with_it(certificate):
         own.receive()
         np.testing.assert_array_equal(loop.decide([4.0]).input, own.decide([4.0]).input)
         assert loop.guaranteed == own.guaranteed
+
+
+def test_batches_and_tensors_handed_to_a_filter_are_invalid(certificate):
+    shield = safety_filter(certificate, PLANT)
+    gradient = torch.zeros(1, requires_grad=True)
+    for estimate, proposed in ((np.zeros((5, 2)), np.zeros((5, 1))), (np.zeros(2), np.zeros((5, 1))), (TWO, gradient)):
+        assert shield.decide(estimate, certificate.Sigma, proposed).reason == "invalid"
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_bounds_of_zero_are_certified_without_a_word():
+    none = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
+    plant = linear_plant(A=[[1.0, 0.1], [-0.3, 0.85]], B=[[0.0], [0.1]], box=[1.0, 2.0], u_max=5.0, dt=0.1, **none)
+    assert synthesize(plant).provenance["share_of_box"] > 0.7

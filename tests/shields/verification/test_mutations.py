@@ -111,7 +111,7 @@ LARGE = [name for name in CASES if CASES[name] in (("servo", "polytope"), ("osci
 LARGE += ["between samples, polytope alone"]
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize(
     ("name", "every"),
     [(name, 20 if name in LARGE else 1) for name in CASES]
