@@ -21,12 +21,19 @@ from ncs_gym.validation import (
     as_setting,
     read_only,
     shown,
+    warn_caller,
 )
 
 # Ends that differ from symmetric ones by less, relative to the nearer one, are symmetric: that is rounding.
 NEARLY_SYMMETRIC = 1e-12
+# A state that the box says nothing of is as large as this many times what it reaches from rest in n steps.
+FREE_REACH = 100.0
 # Times of a step at which limits of states may count.
 MOST_POINTS = 64
+
+
+class ChosenLimitsWarning(UserWarning):
+    """No state has a limit: half-widths of the safe box were chosen, far beyond what inputs reach in a few steps."""
 
 
 class Rows(NamedTuple):
@@ -241,6 +248,13 @@ class LimitValues(ReadOnlyArrays):
         return np.concatenate([values, self.mixed_values(state, np.zeros((self.B.shape[1], *state.shape[1:])))])
 
 
+def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Returns a bound on every |x_j|, shape (n,), n steps after |x| <= reach, (n,), with |u| <= largest_input, (m,)."""
+    for _ in range(len(A)):
+        reach = exact.product(np.abs(np.hstack([A, B])), np.concatenate([reach, largest_input]))
+    return reach
+
+
 def _beyond(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Returns how far values, shape (k,) or (k, N), are beyond the nearer of their ends, shape (2, k)."""
     low, high = ends if values.ndim == 1 else ends[:, :, None]
@@ -347,7 +361,7 @@ class Limits(ReadOnlyArrays):
             (of_states if of_input is None else mixed).append(Rows.of(c[:, :n] if of_input is None else c, ends))
         box, together = Rows.joined(of_states, n), Rows.joined(mixed, n + m)
         if not len(box.rows):
-            raise ValueError("no limit of a state is finite: give Limits(state=...) or rows, if generous ones")
+            box = _chosen(model, inputs)
         values = LimitValues()
         values._set(A=model.A, B=model.B, H=model.H, past=0, is_past_row=np.zeros(len(box.rows), np.bool_))
         values._set(box=box.rows, box_ends=box.ends, mixed_rows=together.rows, mixed_ends=together.ends)
@@ -384,9 +398,24 @@ class Limits(ReadOnlyArrays):
         widths = as_setting(given)
         if widths is None or widths.shape not in ((), getattr(model, name).shape):
             return given
-        if model.at is not None or not (widths > 0.0).all():
+        if model.at is not None or not (widths > 0.0).all() or np.isinf(widths).all():
             raise ValueError(
-                f"{name} limits must be positive half-widths, or a pair (low, high) of vectors, as beside at= of a "
-                f"Model, where they are absolute, got {shown(given)}"
+                f"{name} limits must be positive half-widths, not all infinite, or a pair (low, high) of vectors, as "
+                f"beside at= of a Model, where they are absolute, got {shown(given)}"
             )
         return -widths, widths
+
+
+def _chosen(model: Model, inputs: np.ndarray) -> Rows:
+    """Returns half-widths for states without limits: many times what inputs within ends (2, m) reach in n steps.
+
+    Raises:
+        ValueError: If no input moves a state, so that nothing says how large it gets.
+    """
+    reach = reach_in_steps(model.A, model.B, np.abs(inputs).max(axis=0), np.zeros(len(model.A)))
+    if not reach.all():
+        raise ValueError(f"Limits need state=: no input moves state {reach.argmin() + 1}, which none of them limits")
+    widths = np.array([float(exact.rounded(FREE_REACH * each, 1)) for each in reach])
+    text = f"no state has a limit: half-widths {shown(widths.tolist())} were chosen, give Limits(state=...) for others"
+    warn_caller(text, ChosenLimitsWarning)
+    return Rows.of(np.eye(len(widths)), np.array([-widths, widths]))

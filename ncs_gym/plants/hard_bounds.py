@@ -12,7 +12,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import DELTA, Ball, Sum, pushes_of
-from ncs_gym.limits import LimitValues
+from ncs_gym.limits import FREE_REACH, LimitValues, reach_in_steps
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from ncs_gym.validation import read_only, setting
@@ -21,8 +21,6 @@ from ncs_gym.validation import read_only, setting
 INFLATION = 1.0 + 1e-9
 # The same for directions in which a bound is flat: growth of its diagonal alone.
 FLAT_INFLATION = 1e-12
-# A state that the box says nothing of is as large as this many times what it reaches from rest in n steps.
-FREE_REACH = 100.0
 # No disturbance set is thinner than this, in squared half-widths of the safe box.
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
@@ -137,10 +135,7 @@ class HardBounds(LimitValues):
         sources = self.of_disturbance, self.of_first_error
         bounded = [each.shape_matrix for source in sources for each in source.bounded()]
         noise = [np.diag(each) for each in [*(source.noise.covariance for source in sources), *bounded]]
-        reach = np.sqrt(np.sum(noise, axis=0))
-        for _ in range(self.n):
-            reach = exact.product(np.abs(np.hstack([self.A, self.B])), np.concatenate([reach, self.largest_input]))
-        return read_only(reach)
+        return read_only(reach_in_steps(self.A, self.B, self.largest_input, np.sqrt(np.sum(noise, axis=0))))
 
     @cached_property
     def _box_shape(self) -> np.ndarray:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ncs_gym.limits import ChosenLimitsWarning
 from tests.product import altered, linear_plant
 
 QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
@@ -84,6 +85,17 @@ def test_own_limits_are_the_closest_of_each_state_alone():
     limits = [(row, low, high) for row, low, high in zip(rows, (-1, -4, -1, -np.inf), (5, 6, 1, 2), strict=True)]
     plant = linear_plant(A=0.5 * np.eye(3), B=np.ones((3, 1)), u_max=1.0, dt=0.1, output_limits=limits, **QUIET)
     np.testing.assert_allclose(plant.own_limits, [[-1.0, -np.inf, -np.inf], [2.0, np.inf, 0.5]])
+
+
+def test_half_widths_are_chosen_where_inputs_alone_are_limited():
+    """What |u| <= 2 moves from rest in two steps is .4 and .2; a hundred times that is far beyond what counts."""
+    model = {"A": [[1.0, 1.0], [0.0, 1.0]], "B": [[0.1], [0.05]], "dt": 0.1} | dict.fromkeys(QUIET, 0.0)
+    with pytest.warns(ChosenLimitsWarning, match=r"half-widths \[50.0, 20.0\] were chosen"):
+        plant = linear_plant(**model, u_max=2.0)
+    np.testing.assert_allclose(plant.box_rows, np.diag([1.0 / 50.0, 1.0 / 20.0]))
+    with pytest.warns(ChosenLimitsWarning):
+        same = linear_plant(**model, u_max=2.0, state_limits=(-np.inf, [np.inf, np.inf]))
+    assert same.fingerprint == plant.fingerprint
 
 
 def test_state_without_a_limit_has_the_size_that_its_own_units_and_inputs_give_it():
