@@ -239,8 +239,8 @@ def _attacked_board(
     """Returns guaranteed steps, how many were outside, and how far the state got, 1 at the boundary of the set."""
     rng, polytope, (n, m, _, h, _) = np.random.default_rng(0), certificate.polytope, table.sizes.values()
     assert polytope is not None
-    memory = ctypes.create_string_buffer(8 * (2 * n + (h + 1) * m) + 64)
-    reason = np.frombuffer(memory, np.int32)[2 * (2 * n + (h + 1) * m) + 5 :]  # after five counters
+    memory = np.zeros(2 * (2 * n + (h + 1) * m) + 16, np.int32)
+    reason, (low, high) = memory[2 * (2 * n + (h + 1) * m) + 5 :], plant.input_ends  # after five counters
     u, guaranteed, outside, farthest, oldest, mixes = np.zeros(m), 0, 0, 0.0, 0, False
     noises = plant.nominal_disturbance, plant.nominal_sensor_error
 
@@ -250,7 +250,7 @@ def _attacked_board(
     for episode in range(steps // _EPISODE):
         x = rng.standard_normal(n) * plant.half_widths
         x = polytope.center + rng.uniform(0.5, 0.999) / polytope.gauge(polytope.center + x) * x
-        assert c.ncs_start(memory, episode, at(x + plant.nominal_initial_error.sample_boundary(rng)))
+        assert c.ncs_start(at(memory), episode, at(x + plant.nominal_initial_error.sample_boundary(rng)))
         taken: list[np.ndarray] = []
         for step in range(_EPISODE):
             if step % _PATIENCE == 0:
@@ -260,10 +260,10 @@ def _attacked_board(
             taken.append(plant.H @ x + v)
             ages = [h, oldest, *rng.integers(h + 1, size=2 * mixes).tolist()]
             for age in sorted((each for each in ages if step - each >= 1), reverse=True):
-                c.ncs_receive(memory, episode, step - age, at(taken[step - age]))
-            outwards = np.where(plant.B.T @ f > 0.0, plant.input_high, plant.input_low)
-            proposed = rng.choice([outwards, rng.uniform(1.5 * plant.input_low, 1.5 * plant.input_high), np.nan * u])
-            c.ncs_decide(memory, at(proposed), at(u))
+                c.ncs_receive(at(memory), episode, step - age, at(taken[step - age]))
+            outwards = np.where(plant.B.T @ f > 0.0, high, low)
+            proposed = rng.choice([outwards, rng.uniform(1.5 * low, 1.5 * high), np.nan * u])
+            c.ncs_decide(at(memory), at(proposed), at(u))
             if reason[0] == GUARANTEED:
                 guaranteed, farthest = guaranteed + 1, max(farthest, float(polytope.gauge(x)))
                 outside += int(polytope.gauge(x) > 1.0 + 1e-9 or plant.constraint_values(x).max() > 1e-9)
