@@ -92,6 +92,7 @@ SECONDARY = {
     "penalized": Entry("penalized", seeds=5),
     "lagrangian": Entry("lagrangian", seeds=5),
     "lagrangian:0.1": Entry("lagrangian:0.1", seeds=5),
+    "lagrangian:1": Entry("lagrangian:1", seeds=5),
     "unshielded, attacked": Entry("unshielded", attacked=True, seeds=5),
     "lookahead": Entry("lookahead", seeds=5),
 }
@@ -463,8 +464,9 @@ def differences_table(found: dict[str, Any]) -> str:
     """Returns the sentences about who is better, as numbers of both blocks: see the page."""
     pairs = (
         ("violating", ATTACKED, 100.0, "unshielded", "shielded"),
-        ("violating", ATTACKED, 100.0, "trusting:20", "shielded"),
         ("return", AS_TRAINED, 1.0, "shielded", "shield at test"),
+        ("return", AS_TRAINED, 1.0, "shielded, disturbance", "shielded"),
+        ("return", AS_TRAINED, 1.0, "lqr:observer+shielded", "shielded, disturbance"),
         ("return", AS_TRAINED, 1.0, "lqr:observer+shielded", "shielded"),
     )
     rows = [["first less second", "by block", "interval"]]
