@@ -84,7 +84,6 @@ PRIMARY = {
     "trusting:20": Entry("trusting:20"),
     "shielded": Entry("shielded", everywhere=True),
     "shielded, disturbance": Entry("shielded", observed="disturbance"),
-    "shielded, memory": Entry("shielded", observed="memory"),
     "shield at test": Entry("unshielded", "shielded", everywhere=True),
     "shield in training": Entry("shielded", "unshielded", everywhere=True),
 }
@@ -94,6 +93,7 @@ SECONDARY = {
     "lagrangian:0.1": Entry("lagrangian:0.1", seeds=5),
     "lagrangian:1": Entry("lagrangian:1", seeds=5),
     "unshielded, attacked": Entry("unshielded", attacked=True, seeds=5),
+    "shielded, memory": Entry("shielded", observed="memory", seeds=5),
     "lookahead": Entry("lookahead", seeds=5),
 }
 REGULATED = {
