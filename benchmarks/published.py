@@ -259,7 +259,7 @@ def _intervals(plant: LinearPlant) -> np.ndarray:
         states = np.flatnonzero(row)
         if len(states) == 1:
             size = Fraction(row[states[0]])
-            low, high = sorted(each * np.sign(size) if np.isinf(each) else Fraction(each) / size for each in two)
+            low, high = sorted(each * float(size) if np.isinf(each) else Fraction(each) / size for each in two)
             ends[:, states[0]] = max(ends[0, states[0]], low), min(ends[1, states[0]], high)
     return ends
 
