@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from textwrap import fill
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from ncs_gym.bounds import Bounds, Box, Through
 from ncs_gym.model import Model
+from ncs_gym.plants.description import of_outputs
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_names, as_number, as_setting, counted, shown
 
 # A record has at least so many windows, half of which are held against the other half.
@@ -184,7 +185,7 @@ def bounds_from_recording(
     may_leave = np.abs(found[half:]) > (1.0 + _PRECISION) * np.abs(found[:half]).max(axis=0)
     one = np.linalg.pinv(H) if record.window == 1 else np.full((n, p), np.inf)
     directions = names["states"] if is_identity else [f"E{i + 1}" for i in range(E.shape[1])]
-    measured = output_names(H, names["states"])
+    measured = of_outputs(H, names["states"])
     signals = [*measured, *names["inputs"]]
     return RecordedBounds(
         E=E,
@@ -205,12 +206,6 @@ def bounds_from_recording(
         ),
         first_error=np.abs(one) @ phi if record.window == 1 else np.full(n, np.inf),
     )
-
-
-def output_names(H: np.ndarray, states: Sequence[str]) -> list[str]:
-    """Returns names of outputs: that of a state that is measured alone, else y1, y2, ..."""
-    alone = (np.abs(H).sum(axis=1) == 1.0) & (H.max(axis=1) == 1.0)
-    return [str(states[row.argmax()]) if alone[j] else f"y{j + 1}" for j, row in enumerate(H)]
 
 
 class _Record:

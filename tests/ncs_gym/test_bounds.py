@@ -3,6 +3,7 @@
 import json
 import warnings
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import pytest
@@ -69,12 +70,6 @@ def test_supports_of_a_sum_add_up_and_its_middles_too():
     assert both.support(np.array([1.0, -2.0])) == one.support(np.array([1.0, -2.0])) + 1.0
 
 
-def test_an_array_and_a_set_are_a_sum_on_either_side():
-    for both in (np.array([0.1, 0.2]) + Box(-1.0, 3.0), Box(-1.0, 3.0) + np.array([0.1, 0.2])):
-        np.testing.assert_array_equal(both.middle, [1.0, 1.0])
-        np.testing.assert_allclose(both.sized(2).support(np.eye(2)), [2.1, 2.2])
-
-
 def test_arrays_of_sets_cannot_be_written_to():
     for own in (Box([0.0], [1.0]).low, Through(E, 0.1).E, Gaussian(np.eye(2), 0.1).covariance):
         with pytest.raises(ValueError, match="read-only"):
@@ -84,8 +79,8 @@ def test_arrays_of_sets_cannot_be_written_to():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Box([0.0, 1.0], [1.0]), "vectors of one size"),
-        (lambda: Box(1.0, 0.0), "a box needs two finite ends, low <= high"),
+        (lambda: Box([0.0, 1.0], [1.0]), r"of one size, .* got \(\[0.0, 1.0\], \[1.0\]\)"),
+        (lambda: Box(1.0, 0.0), "low <= high"),
         (lambda: Box([0.0], [np.inf]), "two finite ends"),
         (lambda: as_set(np.inf), "two finite ends"),
         (lambda: Ball(-1.0), "the radius of a ball must be a number >= 0"),
@@ -95,27 +90,21 @@ def test_arrays_of_sets_cannot_be_written_to():
         (lambda: Through([[1e-30]], 1e-30), "must be 0 or at least"),
         (lambda: Sum((Gaussian([[1.0]], 0.1), Gaussian([[1.0]], 0.1))), "one Gaussian"),
         (lambda: Box([0.0], [1.0]) + Box([0.0, 0.0], [1.0, 1.0]), "dimension 1 is needed, got one in dimension 2"),
-        (
-            lambda: as_set([[1.0, 1.0], [1.0, 2.0]]),
-            "a set must be a number, a vector of half-widths or one of Ellipsoid,",
+        *(
+            (partial(as_set, given), "a set must be")
+            for given in ([[1.0, 1.0], [1.0, 2.0]], {"Box": {"low": 0.0}}, None)
         ),
-        (lambda: as_set({"Box": {"low": 0.0}}), "a set must be a number"),
-        (lambda: as_set(None), "a set must be a number"),
         (lambda: Bounds(0.1, "a", 0.0), r"Bounds\(sensor=...\): a set must be"),
-        (lambda: Through(E, Gaussian(np.eye(2), 0.1)), "a Gaussian of covariance E P E'"),
-        (lambda: Through(E, Ball(0.1) + Gaussian(np.eye(2), 0.1)), "a Gaussian of covariance E P E'"),
-        (lambda: Through(E, Remainder(Ellipsoid(np.eye(2)), True, "given")), "is not taken through E"),
-        (lambda: Through(E, Ball(0.1) + Remainder(Ellipsoid(np.eye(2)), True, "given")), "is not taken through E"),
+        (lambda: Through(E, Gaussian(np.eye(2), 0.1)), "takes no Gaussian"),
+        (lambda: Through(E, Ball(0.1) + Gaussian(np.eye(2), 0.1)), "takes no Gaussian"),
+        (lambda: Through(E, Ball(0.1) + Remainder(Ellipsoid(np.eye(2)), True, "given")), "and no remainder"),
         (lambda: Through(E, Sum(())), "a sum of no sets"),
         (lambda: Sum(()).ellipsoid(), "a sum of no sets"),
         (lambda: Bounds(0.1, Box(0.0, 0.2), 0.1), r"Bounds\(sensor=...\) must have its middle at zero, got 0.1"),
         (lambda: Bounds(0.1, 0.1, Box([0.0, -1.0], [0.2, 1.0])), r"first_error=...\) must have its middle at zero"),
         (lambda: Bounds(0.1, Through([[1.0]], Box(0.0, 0.2)) + Ball(0.1), 0.1), "must have its middle at zero"),
         (lambda: small(np.eye(2), sensor_bound=Box(0.0, 0.2)), "must have its middle at zero"),
-        (
-            lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sums(3, 1),
-            r"Bounds\(first_error=...\): a set in dimension 3 is needed",
-        ),
+        (lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sums(3, 1), r"first_error=...\): a set in dimension 3 is needed"),
     ],
 )
 def test_what_is_no_set_is_refused(make, message):
@@ -129,8 +118,3 @@ def test_half_widths_reach_both_ends_where_rounding_moves_the_middle():
     exact = [[Fraction(each) for each in numbers.tolist()] for numbers in (box.low, box.high, box.middle, box.half)]
     assert all(middle - half <= low and high <= middle + half for low, high, middle, half in zip(*exact, strict=True))
     assert (0.5 * (box.high - box.low) < box.half).any()
-
-
-def test_bounds_have_no_defaults():
-    with pytest.raises(TypeError, match="first_error"):
-        Bounds(0.1, 0.1)

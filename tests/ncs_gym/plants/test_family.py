@@ -208,7 +208,8 @@ def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolut
     given = (of, {"k": (0.19, 0.21)}) if kind == "function" else ([of(k) for k in values],)
     plant = family_of(*given, monotone=kind == "function", at_rest=True)
     assert "at rest at its operating point (given)" in plant.remainder.sentence
-    np.testing.assert_allclose(plant.operating_input + plant.input_ends[:, 0], [0.0, 2.0], atol=1e-15)
+    x0, u0 = plant.operating_state, plant.operating_input
+    np.testing.assert_allclose(u0 + plant.input_ends[:, 0], [0.0, 2.0], atol=1e-15)
     np.testing.assert_allclose(plant.operating_state[0] + plant.box_ends[:, 0] / plant.box[0, 0], [1.5, 2.5])
     size, largest = np.sqrt(plant.remainder.bound.shape_matrix[0, 0]), 0.0
     for k in (*values, *np.linspace(0.19, 0.21, 7)):
@@ -216,9 +217,8 @@ def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolut
         for level, acts, decided in itertools.product((1.5, 2.5), (0.0, 2.0), (0.0, 2.0)):
             acts = acts if delay else decided
             truth = [decay * level + 0.5 * (1.0 - decay) / k * acts, *[decided] * delay]
-            model = plant.A @ plant.to_deviation([level, *[acts] * delay])
-            model = model + plant.B @ plant.to_deviation([decided], "input")
-            left_out = plant.to_deviation(truth) - model
+            model = plant.A @ ([level, *[acts] * delay] - x0) + plant.B @ (decided - u0)
+            left_out = truth - x0 - model
             np.testing.assert_allclose(left_out[1:], 0.0, atol=1e-15)
             largest = max(largest, abs(left_out[0]))
     assert 0.5 * size < largest <= size
@@ -227,9 +227,8 @@ def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolut
         parameters = {"k": k} if kind == "function" else {"member": values.index(k)}
         info = env.reset(seed=0, options={"parameters": parameters})[1]
         for _ in range(60):
-            rests = plant.to_deviation([0.8], "input")
-            info = env.step((rests - plant.input_middle) / plant.input_half)[-1]
-        np.testing.assert_allclose(plant.from_deviation(info["state"])[0], 0.4 / k, atol=2e-3)
+            info = env.step((0.8 - u0 - plant.input_middle) / plant.input_half)[-1]
+        np.testing.assert_allclose((info["state"] + x0)[0], 0.4 / k, atol=2e-3)
 
 
 def test_members_are_at_rest_where_somebody_says_so():
