@@ -26,7 +26,11 @@ DELTA = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Box(UncertainSet):
-    """{z : low <= z <= high}, with ends of shape (n,), or numbers for every entry."""
+    """{z : low <= z <= high}, with ends of shape (n,), or numbers for every entry.
+
+    Raises:
+        ValueError: If they are no such ends, or low > high anywhere.
+    """
 
     low: Any
     high: Any

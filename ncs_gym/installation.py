@@ -25,15 +25,7 @@ def install_command(extra: str) -> str:
 
 
 def require_own_packages(*names: str) -> None:
-    """Raises unless the packages that Python finds by these names are this project's.
-
-    Args:
-        names: Some of `GENERIC_NAMES`.
-
-    Raises:
-        ImportError: If another package is found first, or another distribution has overwritten ours; the message says
-            where it is and what to do.
-    """
+    """Raises ImportError unless the packages that Python finds by these of `GENERIC_NAMES` are this project's."""
     for name in names:
         spec = find_spec(name)
         place = "nowhere" if spec is None else spec.origin or ", ".join(spec.submodule_search_locations or ())
