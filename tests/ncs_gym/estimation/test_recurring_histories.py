@@ -14,7 +14,7 @@ IDS = sorted(each for each in gym.registry if each.startswith("ncs_gym/") and ea
 MOST = 6_000
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("env_id", IDS)
 def test_histories_of_a_vector_recur(env_id):
     envs = gym.make_vec(env_id, 1024)

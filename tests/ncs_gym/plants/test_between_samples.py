@@ -104,7 +104,7 @@ def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
     plant = altered(truck_trailer(mass=4000.0), between_samples=8)
     env = gym.make(CRUISE, plant=plant, disturbance="sphere")
     rng, between_alone, total = np.random.default_rng(0), 0, 0.0
-    for episode in range(12):
+    for episode in range(3):
         _, info = env.reset(seed=episode)
         np.testing.assert_array_equal(info["worst_constraint_values"], info["constraint_values"])
         for k in range(60):
@@ -118,20 +118,6 @@ def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
             inside = max(before["constraint_values"].max(), info["constraint_values"].max()) <= 0.0
             between_alone += inside and info["cost"] == 1.0
     assert between_alone  # the box was left between two samples that are inside
-
-
-def test_violation_between_samples_ends_an_episode_if_violations_do():
-    plant = altered(truck_trailer(mass=4000.0), between_samples=8)
-    env = gym.make(CRUISE, plant=plant, terminate_on_violation=True)
-    for seed in range(5):
-        env.reset(seed=seed)
-        terminated = False
-        for k in range(100):
-            *_, terminated, _, info = env.step(np.array([(-1.0) ** (k // 3)], np.float32))
-            assert terminated == (info["cost"] > 0.0)
-            if terminated:
-                break
-        assert terminated
 
 
 def test_once_per_step_is_at_the_sampling_instants_alone():

@@ -162,9 +162,8 @@ def test_middle_is_the_middle_of_the_entries_and_all_else_that_of_the_members():
 
 
 def test_what_is_proved_stands_in_the_sentence_of_a_certificate():
-    assert "bounded by proof" in TRUCK.remainder.sentence
-    assert "mass from 3800 to 4200" in TRUCK.remainder.sentence
-    assert "monotone" in TRUCK.remainder.sentence
+    for words in ("bounded by proof", "mass from 3800 to 4200", "monotone"):
+        assert words in TRUCK.remainder.sentence
     assert "the convex hull of 3 plants" in HULL.remainder.sentence
 
 
@@ -306,7 +305,7 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
             replace(TRUCK.members, **changes)
     document = json.loads(json.dumps(TRUCK.document))
     family_in(document)["interval"] = None
-    with pytest.raises(ValueError, match="needs the interval of its entries"):
+    with pytest.raises(ValueError, match="needs interval"):
         LinearPlant.load(document)
     document = json.loads(json.dumps(TRUCK.document))
     family_in(document)["members"][0][1][2] *= 3.0
@@ -413,8 +412,6 @@ def spiked(mass):
 def test_entries_that_are_not_monotone_are_found_on_the_grid_or_when_they_are_drawn():
     with pytest.raises(ValueError, match=r"B\[1, 0\] is not monotone in mass from 0 to 1"):
         family_of(bent, {"mass": (0.0, 1.0)}, monotone=True)
-    half = family_of(bent, {"mass": (0.0, 0.5)}, monotone=True)
-    assert half.remainder.bound.shape_matrix[1, 1] > 0.0
     env = loop_env(family_of(spiked, {"mass": (0.0, 1.0)}, monotone=True, all_points=True))
     env.reset(options={"parameters": {"mass": 1.0 / 255}})
     with pytest.raises(ValueError, match=r"B\[1, 0\] at .* is not between those at the ends"):

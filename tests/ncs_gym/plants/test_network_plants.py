@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ncs_gym.model import zero_order_hold
 from ncs_gym.plants.convoy import convoy
 from ncs_gym.plants.lane_keeping import lane_keeping
 from ncs_gym.plants.stirred_tank import stirred_tank
-from tests.product import altered
 
 
 def test_tank_runs_away_at_the_rate_of_its_unstable_pole():
@@ -27,12 +25,3 @@ def test_car_moves_sideways_with_its_heading():
     plant = lane_keeping()
     np.testing.assert_allclose(plant.A, [[1.0, 20.0 * 0.05], [0.0, 1.0]], rtol=1e-12)
     np.testing.assert_allclose(plant.B, [[20.0 * 0.05**2 / 2.0], [0.05]], rtol=1e-12)
-
-
-@pytest.mark.parametrize("plant", [stirred_tank, convoy, lane_keeping])
-def test_their_model_in_continuous_time_is_the_one_that_was_sampled(plant):
-    found, longer = plant(), plant(dt=1.5 * plant().dt)
-    assert altered(found, between_samples=4).grid_rows.state.shape == (4, 2, 2)
-    of_longer = zero_order_hold(*np.split(found.continuous_model, [found.n], axis=1), longer.dt)
-    for own, other in zip(of_longer, (longer.A, longer.B), strict=True):
-        np.testing.assert_allclose(own, other, rtol=1e-12, atol=1e-15)

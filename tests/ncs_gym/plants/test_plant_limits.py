@@ -95,26 +95,3 @@ def test_state_without_a_limit_has_the_size_that_its_own_units_and_inputs_give_i
     units = np.array([1.0, 1e6])
     in_micrometers = linear_plant(A=A * units[:, None] / units, B=B * units[:, None], box=[1.0, np.inf], **settings)
     np.testing.assert_allclose(in_micrometers.half_widths, in_meters.half_widths * units, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "limits",
-    [
-        {"input_limits": (0.0, 5.0), "operating_input": [0.0]},
-        {"input_limits": (0.0, 5.0)},
-        {"input_limits": (-1.0, 5.0), "operating_state": [0.0], "state_limits": (0.0, 1.0)},
-    ],
-)
-def test_nothing_rests_at_an_end_of_its_limits(limits):
-    model = {"A": [[0.9]], "B": [[0.1]], "dt": 1.0, "sensor_bound": 0.0, "initial_bound": 0.0, "disturbance_bound": 0.0}
-    with pytest.raises(ValueError, match=r"the operating point, .* strictly between"):
-        linear_plant(**model | ({} if "state_limits" in limits else {"box": 1.0}) | limits)
-
-
-def test_disturbance_may_act_in_some_directions_alone():
-    model = {"A": 0.9 * np.eye(2), "B": np.ones((2, 1)), "dt": 1.0, "box": 1.0, "u_max": 1.0}
-    some = linear_plant(
-        **model, disturbance_bound=(np.eye(2), [-0.0, -0.1], [0.0, 0.1]), sensor_bound=0.0, initial_bound=0.0
-    )
-    own = linear_plant(**model, disturbance_bound=[0.0, 0.1], sensor_bound=0.0, initial_bound=0.0)
-    assert some.fingerprint == own.fingerprint

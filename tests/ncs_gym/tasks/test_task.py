@@ -90,14 +90,6 @@ def test_change_of_the_input_has_its_price_and_the_last_input_is_observed(plant)
     )
 
 
-def test_farthest_equilibrium_is_where_full_throttle_holds_the_coupling():
-    plant = truck_trailer()
-    farthest = farthest_equilibrium(plant, np.array([1.0, 0.0]))
-    assert farthest == pytest.approx(1000.0 * 4.0 / 4500.0)  # the coupling's pull at full throttle
-    assert setpoints(reach=farthest).check(plant) == ""
-    assert farthest_equilibrium(plant, np.array([0.0, 1.0])) == pytest.approx(0.0, abs=1e-9)
-
-
 def test_farthest_equilibrium_is_that_of_a_search_over_all_inputs():
     rng = np.random.default_rng(3)
     for _ in range(5):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid
-from ncs_gym.bounds import Box, Through, as_set
+from ncs_gym.bounds import Through, as_set
 from ncs_gym.uncertainty.disturbances import diagonal_inside, sample_box
 
 
@@ -28,11 +28,6 @@ def test_directions_and_sizes_give_an_ellipsoid_around_every_combination(w, widt
     combinations = [E @ (np.array(widths) * signs) for signs in itertools.product([-1.0, 1.0], repeat=2)]
     np.testing.assert_allclose(bound.gauge(combinations), 1.0, rtol=1e-9)
     assert bound.gauge([0.0, 1.0, 0.0]) == np.inf  # off the plane that E spans
-
-
-@pytest.mark.parametrize("zero", [Box([0.0, 0.0], [0.0, 0.0]), Through([[1.0], [1.0]], 0.0)])
-def test_zero_is_a_bound(zero):
-    np.testing.assert_array_equal(zero.ellipsoid().shape_matrix, np.zeros((2, 2)))
 
 
 def test_box_of_half_widths_is_drawn_from_to_its_edges_and_no_further():

@@ -29,7 +29,7 @@ def test_other_arguments_change_beside_the_remainder(tmp_path):
     twins = LinearPlant.load(tmp_path / "plant.json"), copy.deepcopy(PLANT), pickle.loads(pickle.dumps(PLANT))
     for twin in twins:
         assert twin.fingerprint == PLANT.fingerprint
-        with pytest.raises(ValueError, match="other limits"):
+        with pytest.raises(ValueError, match="another model, limits or operating point"):
             altered(twin, box=[1.0, 1.0])
 
 
