@@ -36,7 +36,8 @@ class Box(UncertainSet):
     high: Any
 
     def __post_init__(self) -> None:
-        given, ends = (self.low, self.high), [as_setting(self.low), as_setting(self.high)]
+        given: Any = self.low, self.high
+        ends: list[Any] = [*map(as_setting, given)]
         fits = all(each is not None and each.ndim <= 1 and each.size and np.isfinite(each).all() for each in ends)
         fits = fits and len({*map(np.shape, ends)} - {()}) <= 1
         low, high = np.array(np.broadcast_arrays(*ends)) if fits else np.array([1.0, 0.0])

@@ -113,4 +113,4 @@ def _factor(size: float) -> str:
 def of_outputs(H: np.ndarray, of_states: Sequence[str], otherwise: str = "y{}") -> list[str]:
     """Returns names, or units, of outputs: those of states that are measured alone, else y1, y2, ..."""
     alone = (np.abs(H).sum(axis=1) == 1.0) & (H.max(axis=1) == 1.0)
-    return [of_states[row.argmax()] if alone[j] else otherwise.format(j + 1) for j, row in enumerate(H)]
+    return [str(of_states[row.argmax()]) if alone[j] else otherwise.format(j + 1) for j, row in enumerate(H)]

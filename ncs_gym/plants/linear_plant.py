@@ -150,7 +150,9 @@ class LinearPlant(BetweenSamples):
         """
         Path(path).write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
 
-    __str__ = described
+    def __str__(self) -> str:
+        return described(self)
+
     assumptions = property(assumptions_of)
 
     def __repr__(self) -> str:
