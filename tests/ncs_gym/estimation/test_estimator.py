@@ -17,7 +17,6 @@ from ncs_gym.estimation.kalman_filter import ErrorRecursion, predicted_covarianc
 from ncs_gym.estimation.set_membership import SetMembership, enlarged_by_rounding
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.hard_bounds import FLAT_INFLATION
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
@@ -334,7 +333,7 @@ def test_shape_without_any_extent_is_rounded_up_to_a_finite_one():
     assert values[1] < 0.01 * np.linalg.eigvalsh(sets.error_set.Sigma)[1]
 
 
-@pytest.mark.parametrize("plant", [truck_trailer(), cart_pole(), batch_reactor()])
+@pytest.mark.parametrize("plant", [truck_trailer(), cart_pole()])
 def test_covariances_and_gains_are_those_of_filterpy(plant):
     estimator = Estimator(plant, Channel(quantization_step=0.01), certified_error_set(plant, ChannelContract(3, 0.01)))
     estimator.reset(0.01 * np.ones(plant.n))

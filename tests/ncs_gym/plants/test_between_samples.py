@@ -81,16 +81,6 @@ def test_bound_that_is_out_of_reach_says_so():
             asked()
 
 
-def test_bound_is_no_larger_than_it_needs_to_be():
-    plant = altered(truck_trailer(mass=4000.0), between_samples=8)
-    # The worst second derivative at the beginning of a step, by hand: x2' of the first row, x2'' of the second.
-    stretch = (4.5 / 4.0 * 2.0 + 4.6 / 4.0 * 2.0 + 4.0) / 2.0
-    h = 0.5 / 8
-    assert h**2 / 8 * stretch <= plant.grid_rows.remainder[0] <= 1.2 * h**2 / 8 * stretch
-    finer = altered(plant, between_samples=32).grid_rows.remainder
-    assert (finer < plant.grid_rows.remainder / 12.0).all()
-
-
 def fine_values(plant, x, u, x_next):
     """Values of the rows at the grid points after the first, of a step from x to x_next, by scipy, (N, k)."""
     points = plant.between_samples
@@ -104,7 +94,7 @@ def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
     plant = altered(truck_trailer(mass=4000.0), between_samples=8)
     env = gym.make(CRUISE, plant=plant, disturbance="sphere")
     rng, between_alone, total = np.random.default_rng(0), 0, 0.0
-    for episode in range(3):
+    for episode in range(6):
         _, info = env.reset(seed=episode)
         np.testing.assert_array_equal(info["worst_constraint_values"], info["constraint_values"])
         for k in range(60):

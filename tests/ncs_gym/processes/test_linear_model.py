@@ -142,19 +142,6 @@ def test_bound_holds_between_two_different_ends_and_no_further():
     assert halved.remainder.bound.shape_matrix.item() < 0.25 * plant.remainder.bound.shape_matrix.item()
 
 
-def test_loop_shifted_to_the_middle_of_its_limits_is_modeled_as_symmetric():
-    """The same process counted from the middle of its limits: half-widths and two ends say the same."""
-    short = model(samples=500)
-    long = model(
-        box=None,
-        samples=500,
-        state_limits=([-0.25, 0.5], [0.25, 3.5]),
-        operating_state=[0.0, 2.0],
-    )
-    np.testing.assert_allclose(long.A, short.A, atol=1e-8)
-    np.testing.assert_allclose(long.remainder.bound.shape_matrix, short.remainder.bound.shape_matrix, atol=1e-12)
-
-
 def test_shielded_tank_stays_between_its_ends_whatever_disturbs_it():
     """The tank's own equations with a disturbance, in absolute levels, driven to both ends."""
     plant = linear_model(tank, **TANK)

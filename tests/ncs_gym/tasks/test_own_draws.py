@@ -32,10 +32,3 @@ def test_loop_is_the_same_whatever_a_task_draws(make):
             [np.concatenate([np.ravel(info[key]) for key in ("state", "estimate", "packets")]) for info in infos]
         )
     np.testing.assert_array_equal(*seen)
-
-
-def test_seed_renews_what_a_task_draws():
-    env = gym.make("ncs_gym/Convoy-v0")
-    first, other, again = env.reset(seed=1)[0], env.reset()[0], env.reset(seed=1)[0]
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
