@@ -250,8 +250,10 @@ def _from_center(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
     finite = np.isfinite(ends)
     sizes = np.where(finite, np.array([[-1.0], [1.0]]) * ends, 1.0)
     if not ((sizes > SMALLEST_NUMBER) & (sizes < LARGEST_NUMBER)).all():
-        point = f"the operating point, {shown(center.tolist())}, strictly between them"
-        raise ValueError(f"{name} must be of usual size, or infinite, with {point}, got {shown(limits)}")
+        form = (
+            "absolute, of usual size, with the operating point, at=(state, input) of the Model, strictly between them"
+        )
+        raise ValueError(f"{name} must be {form}: it is {shown(center.tolist())}, got {shown(limits)}")
     nearest = sizes.min(axis=0)
     nearly = finite.all(axis=0) & (np.abs(sizes[1] - sizes[0]) <= NEARLY_SYMMETRIC * nearest)
     return np.where(nearly, [-nearest, nearest], ends)
