@@ -265,14 +265,10 @@ def _naming(name: str) -> Iterator[None]:
 
 
 def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
-    """Returns Gaussian noise, of which 95 % count, in proportion to a safe box.
+    """Returns Gaussian noise, of which 95 % count, in proportion to half-widths of a safe box, shape (n,).
 
-    Args:
-        half_widths: Of the box, shape (n,).
-        H: Output matrix, shape (p, n).
-        disturbance: Bound of process noise, as a fraction of the half-widths.
-        sensor: Bound of sensor noise, as a fraction of what the box allows outputs, and of the first error, of the
-            smallest half-width.
+    Process noise is bounded by a fraction of them, sensor noise by one of what they allow outputs H x, and the first
+    error by that of the smallest one.
     """
     outputs, smallest = exact.product(np.abs(H), half_widths), np.full(len(half_widths), half_widths.min())
     sizes = disturbance * half_widths, sensor * outputs, sensor * smallest

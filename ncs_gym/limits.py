@@ -250,9 +250,7 @@ def _from_center(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
     finite = np.isfinite(ends)
     sizes = np.where(finite, np.array([[-1.0], [1.0]]) * ends, 1.0)
     if not ((sizes > SMALLEST_NUMBER) & (sizes < LARGEST_NUMBER)).all():
-        form = (
-            "absolute, of usual size, with the operating point, at=(state, input) of the Model, strictly between them"
-        )
+        form = "absolute, of usual size, the operating point, at=(state, input) of the Model, strictly between them"
         raise ValueError(f"{name} must be {form}: it is {shown(center.tolist())}, got {shown(limits)}")
     nearest = sizes.min(axis=0)
     nearly = finite.all(axis=0) & (np.abs(sizes[1] - sizes[0]) <= NEARLY_SYMMETRIC * nearest)

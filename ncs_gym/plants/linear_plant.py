@@ -126,14 +126,12 @@ class LinearPlant(BetweenSamples):
         Raises:
             ValueError: If the file is missing or not that of a plant, or a value is wrong.
         """
-        document, name = given, "the document"
-        if not isinstance(given, Mapping):
-            name = shown(given)
-            try:
-                document = json_values(read_text(given))
-            except (OSError, TypeError, ValueError, RecursionError) as error:
-                reason = getattr(error, "strerror", None) or "it is not valid JSON"
-                raise ValueError(f"cannot read the plant in {name}: {reason}") from error
+        name = "the document" if isinstance(given, Mapping) else shown(given)
+        try:
+            document = given if isinstance(given, Mapping) else json_values(read_text(given))
+        except (OSError, TypeError, ValueError, RecursionError) as error:
+            reason = getattr(error, "strerror", None) or "it is not valid JSON"
+            raise ValueError(f"cannot read the plant in {name}: {reason}") from error
         if not isinstance(document, Mapping) or document.get("format") != _FORMAT:
             raise ValueError(f"{name} is not a plant of format {_FORMAT!r}")
         try:
@@ -143,11 +141,7 @@ class LinearPlant(BetweenSamples):
             raise ValueError(f"{name} is not that of a plant: {reason_of(error)}") from error
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes a JSON file in which every number is exact.
-
-        Raises:
-            OSError: If the file cannot be written.
-        """
+        """Writes a JSON file in which every number is exact."""
         Path(path).write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
 
     def __str__(self) -> str:

@@ -55,13 +55,7 @@ class Process:
         return None
 
     def choose(self, rng: np.random.Generator, chosen: np.ndarray | None, fixed: np.ndarray | None) -> None:
-        """Draws the parameters of episodes that begin, but for those that `read_parameters` fixed.
-
-        Args:
-            rng: Source of randomness.
-            chosen: Numbers of their environments, shape (k,); None without that axis.
-            fixed: What `read_parameters` returned; None for nothing.
-        """
+        """Draws the parameters of episodes that begin in the chosen environments, but for fixed ones."""
 
     def start(self, rng: np.random.Generator, state: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
         """Starts episodes, and returns the states that they start in.
@@ -69,7 +63,7 @@ class Process:
         Args:
             rng: Source of randomness.
             state: Where to start, shape (n,), or (n, k) for k chosen environments.
-            chosen: Numbers of these environments, shape (k,); None without that axis.
+            chosen: Numbers of these, shape (k,); None without that axis.
         """
         return state
 
