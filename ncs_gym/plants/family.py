@@ -74,24 +74,23 @@ def family(
     """
     at_rest, monotone = as_flag(at_rest, "at_rest"), as_flag(monotone, "monotone")
     if callable(members):
-        found, plants = _of_function(members, ranges, monotone)
+        found, plants, shared = _of_function(members, ranges, monotone)
     elif ranges is None and not monotone:
-        found, plants = _of_plants(members)
+        found, plants, shared = _of_plants(members)
     else:
         raise ValueError("ranges and monotone are about a function of parameters: give a function in place of plants")
-    rest_matters = _rest_matters(found, plants)
+    differs = np.ptp(found.members[..., :-1], axis=0).any(axis=0)
+    rest_matters = bool(np.any(_resting_points(plants)[:, differs]))
     if rest_matters and not at_rest:
         raise ValueError(
             "the members differ in what acts on an operating point that is not zero: say at_rest=True if each is at "
             "rest at its own one, as Model(offset=...) checks"
         )
-    first, n = _around_center(plants[0], _center_of(plants)), len(plants[0].model.A)
+    first, n = shared.first, len(plants[0].model.A)
     own = np.array([np.hstack([each.model.A, each.model.B]) for each in plants])
     middle = 0.5 * (own.min(axis=0) + own.max(axis=0))  # exact where all are the same
     model = replace(first.model, A=middle[:, :n], B=middle[:, n:], offset=None, continuous=None)
-    bounds, cover = first.bounds, _covering(plants)
-    if cover is not first.disturbance_bound:
-        bounds = _with_bound(first, cover)
+    bounds = first.bounds if shared.cover is first.disturbance_bound else _with_bound(first, shared.cover)
     remainder = Remainder(Ellipsoid(np.zeros((n, n))), True, "", replace(found, at_rest=rest_matters))
     return LinearPlant(model, first.limits, replace(bounds, disturbance=bounds.disturbance + remainder), first.labels)
 
@@ -103,11 +102,6 @@ def _with_bound(plant: LinearPlant, bound: Ellipsoid | None) -> Bounds:
     n = len(plant.model.A)
     others = [] if bound is None else [Ellipsoid(bound.shape_matrix[:n, :n])]
     return replace(plant.bounds, disturbance=Sum((*kept, *others)))
-
-
-def _rest_matters(family: Family, plants: list[LinearPlant]) -> bool:
-    differs = np.ptp(family.members[..., :-1], axis=0).any(axis=0)
-    return bool(np.any(_resting_points(plants)[:, differs]))
 
 
 def _resting_points(plants: list[LinearPlant]) -> np.ndarray:
@@ -168,19 +162,20 @@ def _terms(plant: LinearPlant) -> np.ndarray:
     return reach[: plant.n] + exact.product(np.abs(np.hstack([plant.A, plant.B])), reach)
 
 
-def _of_plants(members: Any) -> tuple[Family, list[LinearPlant]]:
-    """Returns the family of plants, and the plants."""
+def _of_plants(members: Any) -> tuple[Family, list[LinearPlant], _Shared]:
+    """Returns the family of plants, these, and what they share."""
     if not isinstance(members, (list, tuple)) or len(members) < 2:
         raise ValueError(f"a family must be two plants or more, or a function of ranges, got {shown(members)}")
     plants = list(members)
-    _require_alike(plants)
-    center, matrices = _center_of(plants), _matrices(plants)
-    family = Family(names=("member",), parameters=np.arange(len(plants))[:, None], members=matrices, center=center)
-    return family, plants
+    shared, numbers = _Shared.of(plants), np.arange(len(plants))[:, None]
+    family = Family(names=("member",), parameters=numbers, members=_matrices(plants), center=_center_of(plants))
+    return family, plants, shared
 
 
-def _of_function(function: Callable[..., LinearPlant], ranges: Any, monotone: bool) -> tuple[Family, list[LinearPlant]]:
-    """Returns the family of a function, and the plants of its corners."""
+def _of_function(
+    function: Callable[..., LinearPlant], ranges: Any, monotone: bool
+) -> tuple[Family, list[LinearPlant], _Shared]:
+    """Returns the family of a function, the plants of its corners, and what they share."""
     if not isinstance(ranges, Mapping) or not 1 <= len(ranges) <= MOST_PARAMETERS:
         form = f"a dictionary of 1 to {MOST_PARAMETERS} parameters with their (low, high)"
         raise ValueError(f"ranges must be {form}, got {shown(ranges)}")
@@ -195,14 +190,12 @@ def _of_function(function: Callable[..., LinearPlant], ranges: Any, monotone: bo
         raise ValueError(f"the ends of ranges must be finite, got {shown(ranges)}")
     corners = [np.array(corner) for corner in itertools.product(*ends)]
     plants = [function(**dict(zip(names, corner.tolist(), strict=True))) for corner in corners]
-    _require_alike(plants)
-    matrices = _matrices(plants)
+    shared, matrices = _Shared.of(plants), _matrices(plants)
     varies = np.ptp(matrices, axis=0).any(axis=1)  # other rows, as those of past inputs, are the same everywhere
     reach = np.max([each.reach for each in plants], axis=0)
     room = ROOM * (varies * np.abs(matrices[..., :-1]).max(axis=(0, 2)))[:, None] * np.isfinite(reach)
     room = np.column_stack([room, ROOM * _terms_of_step(plants, matrices)])
     interval = np.array([matrices.min(axis=0) - room, matrices.max(axis=0) + room])
-    first, cover = _around_center(plants[0], _center_of(plants)), _covering(plants)
     family = Family(
         names=names,
         parameters=np.array(corners),
@@ -210,10 +203,10 @@ def _of_function(function: Callable[..., LinearPlant], ranges: Any, monotone: bo
         function=function,
         interval=interval,
         center=_center_of(plants),
-        check=_Shared(first, cover, "one inside the ranges"),
+        check=shared.require,
     )
     _check_monotone(family, room)
-    return family, plants
+    return family, plants, shared
 
 
 def _matrices(plants: list[LinearPlant]) -> np.ndarray:
@@ -229,15 +222,6 @@ def _terms_of_step(plants: list[LinearPlant], matrices: np.ndarray) -> np.ndarra
     return np.max(terms, axis=0) * (np.arange(n) < n - plants[0].past)
 
 
-def _require_alike(plants: list[LinearPlant]) -> None:
-    """Raises ValueError unless all are plants that differ in A and B alone, and in where they rest."""
-    for each in plants:
-        _require_member(plants[0], each)
-    first, cover = _around_center(plants[0], _center_of(plants)), _covering(plants)
-    for number, each in enumerate(plants):
-        _Shared(first, cover, f"member {number}")(each)
-
-
 def _require_member(first: LinearPlant, plant: Any) -> None:
     """Raises ValueError unless a plant can be a member of a family, and has the sizes of its first one."""
     if not isinstance(plant, LinearPlant) or plant.remainder is not None or plant.between_samples is not None:
@@ -248,13 +232,23 @@ def _require_member(first: LinearPlant, plant: Any) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Shared:
-    """Refuses a plant that lacks what all members share: that of the first one, counted from where the family rests."""
+    """What members share: the first one, counted from where the family rests, and a bound of all disturbances."""
 
     first: LinearPlant
     cover: Ellipsoid | None
-    name: str
 
-    def __call__(self, plant: Any) -> None:
+    @classmethod
+    def of(cls, plants: list[LinearPlant]) -> _Shared:
+        """Returns that of plants; raises ValueError unless they differ in A and B alone, and in where they rest."""
+        for each in plants:
+            _require_member(plants[0], each)
+        shared = cls(_around_center(plants[0], _center_of(plants)), _covering(plants))
+        for number, each in enumerate(plants):
+            shared.require(each, f"member {number}")
+        return shared
+
+    def require(self, plant: Any, called: str = "one inside the ranges") -> None:
+        """Raises ValueError unless a plant has what members share."""
         _require_member(self.first, plant)
         moved = _around_center(plant, _resting_points([self.first])[0])
         names = [
@@ -265,7 +259,7 @@ class _Shared:
         if not names and not _is_covered(self.first, self.cover, plant):
             names = ["Bounds(disturbance=...)"]
         if names:
-            raise ValueError(f"members of a family may differ in A and B alone, and {self.name} differs in {names[0]}")
+            raise ValueError(f"members of a family may differ in A and B alone, and {called} differs in {names[0]}")
 
 
 def _is_same(one: Any, other: Any, tolerance: float) -> bool:
