@@ -1,15 +1,18 @@
 """Linear models of processes: the fit, the bound on the remainder, and how it is known."""
 
+import copy
+import pickle
 import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, Ellipsoid, FunctionProcess
+from ncs_gym import Channel, Ellipsoid, FunctionProcess, LinearPlant
 from ncs_gym.plants.resting_point import MovedOperatingPointWarning
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.linearization import NoEquilibriumWarning, surrounding_shape
+from ncs_gym.uncertainty.remainder import Remainder
 from tests.certificates import certificate_of
 from tests.product import altered, gym_env, linear_model, safety_shield
 
@@ -286,3 +289,19 @@ def test_remainder_is_not_sampled_where_limits_of_several_entries_forbid(limits)
         fewer = {"mixed_rows": None, "mixed_ends": None}
         with pytest.raises(ValueError, match="another model, limits or operating point"):
             altered(plant, **fewer)
+
+
+def test_remainder_belongs_to_the_plant_that_it_was_found_for(tmp_path):
+    plant = model(samples=400)
+    assert altered(plant, sensor_bound=0.002).remainder is plant.remainder
+    assert altered(plant, box=plant.box.copy()).fingerprint == plant.fingerprint
+    assert altered(plant, box=[1.0, 1.0], remainder=None).remainder is None
+    plant.save(tmp_path / "plant.json")
+    twins = LinearPlant.load(tmp_path / "plant.json"), copy.deepcopy(plant), pickle.loads(pickle.dumps(plant))
+    for twin in twins:
+        assert twin.fingerprint == plant.fingerprint
+        with pytest.raises(ValueError, match="another model, limits or operating point"):
+            altered(twin, box=[1.0, 1.0])
+    remainder = Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example")
+    anew, wider = altered(plant, remainder=remainder), altered(plant, box=[1.0, 1.0], remainder=remainder)
+    assert anew.remainder.sentence == wider.remainder.sentence == remainder.sentence
