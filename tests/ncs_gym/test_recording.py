@@ -117,12 +117,13 @@ def test_outputs_that_do_not_tell_a_direction_leave_no_upper_bound_of_it():
     assert found.bounds(2.0, of="explaining", first_error=0.1).disturbance.half == pytest.approx(2 * found.explaining)
 
 
-def test_five_hundred_steps_of_four_states_take_five_seconds_at_most():
+@pytest.mark.slow
+def test_two_thousand_steps_of_four_states_take_twenty_seconds_at_most():
     model, _, half, phi = case_of("cart_pole")
-    u, y, _ = driven(model, 500, half, phi)
+    u, y, _ = driven(model, 2000, half, phi)
     before = time.process_time()
     bounds_from_recording(model, u, y, sensor=phi)
-    assert time.process_time() - before <= 5.0
+    assert time.process_time() - before <= 20.0
 
 
 @pytest.mark.parametrize(("sizes", "mismatch"), [(lambda u: np.abs(u), 1.0), (None, 1.3)])
