@@ -203,7 +203,7 @@ def _of_function(
         function=function,
         interval=interval,
         center=_center_of(plants),
-        check=shared.require,
+        check=shared,
     )
     _check_monotone(family, room)
     return family, plants, shared
@@ -244,10 +244,10 @@ class _Shared:
             _require_member(plants[0], each)
         shared = cls(_around_center(plants[0], _center_of(plants)), _covering(plants))
         for number, each in enumerate(plants):
-            shared.require(each, f"member {number}")
+            shared(each, f"member {number}")
         return shared
 
-    def require(self, plant: Any, called: str = "one inside the ranges") -> None:
+    def __call__(self, plant: Any, called: str = "one inside the ranges") -> None:
         """Raises ValueError unless a plant has what members share."""
         _require_member(self.first, plant)
         moved = _around_center(plant, _resting_points([self.first])[0])
