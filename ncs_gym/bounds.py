@@ -5,8 +5,8 @@ A number or a vector stands for half-widths per entry. Ellipsoids around sets ar
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,6 +22,7 @@ from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_matrix, as_numb
 SMALLEST_SIZE, LARGEST_SIZE = 1e-37, 1e37
 # Probability that Gaussian noise of the library is truncated at, and that of what is zero.
 DELTA = 0.05
+_NAMES = "disturbance", "sensor", "first_error"
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,34 +235,29 @@ class Bounds(ReadOnlyArrays):
     first_error: Any
 
     def __post_init__(self) -> None:
-        for name in ("disturbance", "sensor", "first_error"):
-            with _naming(name):
-                self._set(**{name: as_set(getattr(self, name))})
-            middle = np.array(getattr(self, name).middle)
+        for name in _NAMES:
+            try:
+                own = as_set(getattr(self, name))
+            except ValueError as error:
+                raise ValueError(f"Bounds({name}=...): {error}") from error
+            self._set(**{name: own})
+            middle = np.array(own.middle)
             if name != "disturbance" and middle.any():
                 raise ValueError(f"Bounds({name}=...) must have its middle at zero, got {shown(middle.tolist())}")
 
     def sums(self, n: int, p: int) -> list[Sum]:
         """Returns the three as sums of sets of a plant with n states and p outputs, or raises ValueError."""
-        sums = [Sum((each,)) for each in (self.disturbance, self.sensor, self.first_error)]
+        sums = [Sum((getattr(self, name),)) for name in _NAMES]
         left_out = [sum(part.is_left_out for part in each.parts) for each in sums]
         if left_out[0] > 1 or any(left_out[1:]):
             raise ValueError("Bounds of disturbances may have one remainder, and others none")
         if len(deltas := {each.gaussian.delta for each in sums if each.gaussian}) > 1:
             raise ValueError(f"all Gaussians of a plant must have the same delta, got {shown(sorted(deltas))}")
-        for name, each, size in zip(("disturbance", "sensor", "first_error"), sums, (n, p, n), strict=True):
-            with _naming(name):
-                each.sized(size)
+        for name, each, size in zip(_NAMES, sums, (n, p, n), strict=True):
+            if each.size not in (None, size):
+                needed = f"a set in dimension {size} is needed, got one in dimension {each.size}"
+                raise ValueError(f"Bounds({name}=...): {needed}")
         return sums
-
-
-@contextmanager
-def _naming(name: str) -> Iterator[None]:
-    """Says in what is refused which of the bounds it is."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"Bounds({name}=...): {error}") from error
 
 
 def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
