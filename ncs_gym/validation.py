@@ -132,7 +132,8 @@ def guarded(array: np.ndarray) -> np.ndarray:
 def require_batched_infos(info: Any, outside: str) -> None:
     """Raises ValueError unless the infos of a vector environment are a dictionary, as the wrapper outside needs."""
     if not isinstance(info, dict):
-        raise ValueError(f"{outside} reads infos as a dictionary: put what makes a list (DictInfoToList) outside of it")
+        text = f"{outside} reads infos as a dictionary, and a wrapper inside makes a list of them"
+        raise ValueError(f"{text}: put it outside of {outside}")
 
 
 def printable(text: str) -> str:
