@@ -72,7 +72,6 @@ def test_no_controller_bears_what_noise_hides_and_a_certificate_bears_less():
         synthesize(bounded_by(2.01), contract=ChannelContract(1))
 
 
-@pytest.mark.slow
 def test_plant_has_a_certificate_with_another_ellipsoid_around_its_first_error():
     """The smallest one around the box of first errors leaves nothing of the limits of the ball and plate."""
     plant, p = script.plant_of("bap_gepoc"), script.published()["bap_gepoc"]
