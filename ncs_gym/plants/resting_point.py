@@ -40,7 +40,7 @@ def at_rest(own: LimitValues, disturbance: Any) -> LimitValues:
     state, applied = ([float(f"{each:.6g}") for each in point] for point in points)
     low, high = np.concatenate([rest.box_ends, rest.input_ends, rest.mixed_ends], axis=1)
     if not ((low < 0.0) & (high > 0.0)).all():
-        raise ValueError(f"the middle of the disturbance rests at {shown(state)}, {shown(applied)}, beyond the limits")
+        raise ValueError(f"a disturbance rests at {shown(state)}, {shown(applied)}, not strictly within the limits")
     text = f"deviations are counted from where the middle of the disturbance rests: {shown(state)}, {shown(applied)}"
     warn_caller(text, MovedOperatingPointWarning)
     step_offset = own.step_offset + exact.product(np.abs(E), np.abs(middle))
@@ -62,7 +62,7 @@ def _resting(own: LimitValues, E: np.ndarray, middle: np.ndarray) -> tuple[np.nd
     x, u = widths * found[:n], reach * found[n:]
     if not residual(A, B, E, x, u, middle)[1]:
         pushed = shown((E @ middle).tolist())
-        raise ValueError(f"no state rests under the middle of the disturbance, {pushed} per step, whatever the input")
+        raise ValueError(f"no state stays where it is under the middle of a disturbance, {pushed} per step")
     x, u = _in_steps(x, np.abs(rows).max(axis=0)), _in_steps(u, 1.0 / reach)
     return x, u, residual(A, B, E, x, u, middle)[0]
 

@@ -230,9 +230,9 @@ def test_disturbance_with_symmetric_ends_leaves_the_operating_point():
     assert of_two.fingerprint == both.fingerprint, "what is always 0 adds nothing"
     with pytest.raises(ValueError, match="low <= high"):
         linear_plant(**settings, disturbance_bound=([[1.0]], [0.1], [-0.1]))
-    with pytest.raises(ValueError, match="no state rests"):
+    with pytest.raises(ValueError, match="no state stays where it is"):
         linear_plant(**settings | {"A": [[1.0]], "B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.1]))
-    with pytest.raises(ValueError, match="beyond the limits"):
+    with pytest.raises(ValueError, match="not strictly within the limits"):
         linear_plant(**settings | {"B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.9]))
 
 
