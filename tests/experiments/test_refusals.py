@@ -117,7 +117,7 @@ ONE_SENTENCE = [
 
 # Known without a certificate, which may take minutes.
 BEFORE_A_CERTIFICATE = [
-    ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a covariance"),
+    ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a Gaussian"),
     ("sweep --env ncs_gym/TruckTrailer-v0 --arms governor", "unknown arm 'governor'; known are unshielded"),
 ]  # fmt: skip
 

@@ -186,7 +186,7 @@ def test_file_and_fingerprint_hold_the_limits(tmp_path):
 
 def test_plant_with_such_limits_has_none_that_are_only_symmetric():
     for name in ("u_max", "box_rows"):
-        with pytest.raises(ValueError, match="the limits of this plant are not"):
+        with pytest.raises(ValueError, match="this needs limits"):
             getattr(PLANTS["coupled"], name)
 
 
