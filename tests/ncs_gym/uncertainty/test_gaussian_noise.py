@@ -140,6 +140,26 @@ def test_bound_violation_probability_counts_only_what_is_gaussian():
     )
 
 
+def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
+    # Escapes counted where they happen, draw by draw: with independent draws the union bound is nearly attained.
+    plant, channel, steps, count = (
+        library_plant(truck_trailer, gamma=0.0, delta=5e-4),
+        Channel(send_period=2),
+        200,
+        2000,
+    )
+    process = simulation_of(vector_env(count, plant=plant, channel=channel, noise="gaussian"))
+    rng, zero, none = np.random.default_rng(1), np.zeros((2, count)), np.zeros(count, np.int64)
+    escaped = plant.initial_noise.bound.gauge(process.first_error(np.random.default_rng(0), count).T) > 1.0
+    memory = process.begin(rng, count)
+    for step in range(1, steps + 1):
+        escaped |= plant.process_noise.bound.gauge(process.draw_disturbance(rng, zero, none, memory).T) > 1.0
+        if step % channel.send_period == 0:
+            escaped |= plant.sensor_noise.bound.gauge(process.measure(rng, zero).T) > 1.0
+    bound = bound_violation_probability(plant, channel, steps)
+    assert 0.8 * bound < escaped.mean() < bound
+
+
 def test_extreme_noise_lies_on_the_bounds_in_scalar_and_vector_environments():
     plant = linear_plant(**CALM, gamma=1e-6, sensor_bound=0.1, initial_bound=0.2)
     for env in both(plant, noise="extreme"):
