@@ -124,5 +124,4 @@ def _diagnosis(plant: LinearPlant) -> Infeasible:
         f"gamma, Q and P0 all scaled by {scale:.3g}",
         "C2",
         1.0 - best.ratio,
-        {"ratio": best.ratio, "kappa": best.kappa, "rho": best.rho, "largest_scale": scale},
     )

@@ -13,12 +13,13 @@ from ncs_gym import LinearPlant
 from ncs_gym.network.contract import ChannelContract
 from shields.certificate import Certificate
 from shields.errors import Infeasible
-from shields.synthesis.alternating_optimization import ALTERNATIONS, largest_set, with_best_gain
+from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.certificate_fields import certificate_of
-from shields.synthesis.design_problem import CandidateDesign, DesignProblem, SymmetricLimits, design_problem
+from shields.synthesis.design_problem import CandidateDesign, SymmetricLimits, design_problem
 from shields.synthesis.invariant_polytope import feedback_of, limits_within_step
 from shields.synthesis.multipliers import with_best_multipliers
 from shields.synthesis.search import Search
+from shields.synthesis.tolerance import Tolerated
 from shields.verification import Report, verify
 
 # Relative tightening of the semidefinite programs, so that the result verifies exactly.
@@ -52,7 +53,8 @@ def certify(
         Infeasible: If the plant has no error set or its safe box is unbounded.
     """
     problem, errors = design_problem(plant, contract)
-    design = _design_at(problem, L, K, _INITIAL_MULTIPLIERS)
+    given = CandidateDesign(*problem.to_scaled(L, K), _INITIAL_MULTIPLIERS, np.empty(0))
+    design = with_best_multipliers(problem, given, problem.error_shapes)
     certificate = replace(certificate_of(plant, problem, design, errors), L=L, K=K)
     return certificate if verify(certificate, plant).valid else None
 
@@ -60,10 +62,8 @@ def certify(
 def largest_ellipsoid(
     plant: LinearPlant,
     contract: ChannelContract | None,
-    gains: Sequence[np.ndarray],
+    gains: Sequence[Tolerated],
     search: Search,
-    start: Certificate | None = None,
-    alternations: int = ALTERNATIONS,
 ) -> Certificate | None:
     """Returns the largest set that alternation finds, verified; None where no set is found for no known reason.
 
@@ -72,10 +72,8 @@ def largest_ellipsoid(
     Args:
         plant: The plant.
         contract: Channel contract, if there is one.
-        gains: Gains, shape (m, n), one of which the search begins at.
+        gains: Gains, one of which the search begins at.
         search: Is told the stages, and holds the best candidate.
-        start: Certificate of a similar problem with as many states and inputs, which the search begins near.
-        alternations: Largest number of them.
 
     Raises:
         Infeasible: If the plant has no design problem, or there is no certificate for a known reason.
@@ -83,7 +81,7 @@ def largest_ellipsoid(
     box_rows = plant.box_rows
     for _ in range(_MOST_BOXES):
         limits = SymmetricLimits(box_rows, plant.u_max)
-        candidate = _candidate(plant, contract, limits, gains, search, start, alternations)
+        candidate = _candidate(plant, contract, limits, gains, search)
         over = None if candidate is None else _over_between_samples(candidate, plant)
         if over is None or over.max() <= 1.0:
             break
@@ -107,18 +105,12 @@ def _candidate(
     plant: LinearPlant,
     contract: ChannelContract | None,
     limits: SymmetricLimits,
-    gains: Sequence[np.ndarray],
+    gains: Sequence[Tolerated],
     search: Search,
-    start: Certificate | None,
-    alternations: int,
 ) -> Certificate | None:
     """Returns the certificate of the largest set within limits, not yet verified; None if no set is found."""
     search("error set")
     problem, errors = design_problem(plant, contract, limits)
-    near = None
-    if start is not None and (shares := start.proofs[-1].shares) is not None:
-        lx, le, ld = shares.tolist()
-        near = _design_at(problem, start.L, start.K, (lx, le, ld))
 
     def certificate(design: CandidateDesign) -> Certificate:
         return certificate_of(plant, problem, with_best_gain(problem, design), errors)
@@ -127,19 +119,11 @@ def _candidate(
         search.candidate = partial(certificate, design)
         search(f"{stage}: {math.exp(0.5 * design.log_det):.4f} of the box ellipsoid's volume")
 
-    found = largest_set(problem, _SLACK, report, gains, near, alternations)
+    found = largest_set(problem, _SLACK, report, [each.K for each in gains])
     if found is None:
         return None
     report("exact verification", found)
     return certificate(found)
-
-
-def _design_at(
-    problem: DesignProblem, L: np.ndarray, K: np.ndarray, multipliers: tuple[float, float, float]
-) -> CandidateDesign:
-    """Returns a set and gain in physical units as a design, with the best multipliers near given ones."""
-    given = CandidateDesign(*problem.to_scaled(L, K), multipliers, np.empty(0))
-    return with_best_multipliers(problem, given, problem.error_shapes)
 
 
 def _over_between_samples(certificate: Certificate, plant: LinearPlant) -> np.ndarray:

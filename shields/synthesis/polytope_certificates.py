@@ -38,6 +38,7 @@ from shields.synthesis.resting_point import (
     disturbance_around,
     improved,
     limits_around,
+    needs_resting_point,
 )
 from shields.synthesis.search import Progress
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
@@ -168,7 +169,6 @@ def around_resting_point(
     contract: ChannelContract | None,
     gains: Sequence[Tolerated],
     progress: Progress,
-    fixed: Rest | None = None,
 ) -> Certificate:
     """Returns a verified certificate of a polytope alone, around a resting point.
 
@@ -179,12 +179,11 @@ def around_resting_point(
         contract: Channel contract; None for none.
         gains: Gains that are tried if they bear the radii.
         progress: Called with a line of text now and then.
-        fixed: The resting point; the one that suits each gain by default.
 
     Raises:
         Infeasible: If there is none: why the polytope of the first gain was given up.
     """
-    tried = _by_share([each for each in gains if each.margin >= 1.0], plant, contract, progress, fixed)
+    tried = _by_share([each for each in gains if each.margin >= 1.0], plant, contract, progress)
     best, reasons = most_tolerant(gains), list[str]()
     for each in [*tried[:_MOST_SOUGHT], *(each for each in tried[_MOST_SOUGHT:] if each is best)]:
         try:
@@ -199,7 +198,6 @@ def _by_share(
     plant: LinearPlant,
     contract: ChannelContract | None,
     progress: Progress,
-    fixed: Rest | None,
 ) -> list[Tolerated]:
     """Returns gains that differ in a certificate's digits, those that keep the most of the box first.
 
@@ -217,7 +215,7 @@ def _by_share(
 
     shares = np.array([share(each.K, each.rest) for each in gains])
     gains = [gains[k] for k in np.argsort(-shares, kind="stable")]
-    if fixed is None:
+    if needs_resting_point(plant):
         progress(f"resting point: {100.0 * shares.max():.1f} % of the box")
         better = improved(plant, gains[0].rest, lambda rest: share(gains[0].K, rest))
         gains = [gains[0]._replace(rest=better), *gains] if better is not gains[0].rest else gains
@@ -245,8 +243,3 @@ def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: P
     reach = {} if "polytope_share_of_box" in sizes else reach_recorded(certificate.polytope, plant)
     others = {name: value for name, value in certificate.provenance.items() if name != "reach"}
     return replace(certificate, provenance=others | sizes | reach)
-
-
-def polytope_share(certificate: Certificate) -> float:
-    """Returns the share of the safe box that a certificate's polytope fills, as far as it is known; 0.0 otherwise."""
-    return certificate.provenance.get("polytope_share_of_box", 0.0)

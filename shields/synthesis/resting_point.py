@@ -13,14 +13,11 @@ from ncs_gym import LinearPlant, exact
 from ncs_gym.plants.hard_bounds import inflated, weight_of
 from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.validation import shown
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import Rest, SymmetricLimits, taken_between_samples
 
 # Significant digits of a resting point, in units of the limits: what differs between processors is beyond them.
 _DIGITS = 12
-# What a state changes by in a step at rest, next to its terms, is rounding up to this.
-_HELD = 1e-12
 # The search for a better point takes steps of these sizes along every direction of the equilibria, in units of the
 # distance at which some limit is reached, as long as one of them helps.
 _STEPS = (0.4, 0.2, 0.1, 0.05, 0.02)
@@ -156,31 +153,6 @@ def rest_at(plant: LinearPlant, point: np.ndarray) -> Rest:
         [float(exact.rounded(each / unit, _DIGITS)) * unit for each, unit in zip(point, scale, strict=True)]
     )
     return Rest(rounded[: plant.n], rounded[plant.n :])
-
-
-def resting_at(plant: LinearPlant, state: np.ndarray) -> Rest:
-    """Returns the resting point at a state, shape (n,), with the smallest input that holds it.
-
-    Raises:
-        ValueError: If no input holds it, or it is not strictly within the limits.
-    """
-    missing = state - plant.A @ state
-    widths = plant.half_widths
-    applied = plant.input_half * np.linalg.lstsq(plant.B * plant.input_half / widths[:, None], missing / widths)[0]
-    terms = np.abs(plant.A) @ np.abs(state) + np.abs(plant.B) @ np.abs(applied) + np.abs(state)
-    left = plant.B @ applied - missing
-    if not (np.abs(left) <= _HELD * terms).all():
-        raise ValueError(
-            f"resting_state must be an equilibrium, and no input holds {shown(state.tolist())}: with the best one, "
-            f"{shown(applied.tolist())}, a step changes it by {shown(left.tolist())}"
-        )
-    rest = Rest(state, applied)
-    if not (distances(plant, rest) > 0.0).all():
-        raise ValueError(
-            f"resting_state must be strictly within the limits, and so must the input that holds it, "
-            f"{shown(applied.tolist())} (deviations from the operating point), got {shown(state.tolist())}"
-        )
-    return rest
 
 
 def distances(plant: LinearPlant, rest: Rest) -> np.ndarray:

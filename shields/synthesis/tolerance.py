@@ -86,19 +86,16 @@ class Tolerance:
     From rest errors and disturbances take a limited quantity c x at most as far as the sum of their supports, step by
     step, by what the closed loop makes of the row c. Where that stays within all limits, the states that stay in them
     for ever are a set around the resting point (Kolmanovsky and Gilbert 1998, docs/bibliography.md); elsewhere there is
-    none.
+    none. The resting point is the operating point where limits are symmetric, else the one that suits each gain.
+
+    Args:
+        plant: The plant.
+        errors: Shapes of the error sets, (l, n, n).
+        D: Shape of the disturbance set, (n, n).
     """
 
-    def __init__(self, plant: LinearPlant, errors: np.ndarray, D: np.ndarray, fixed: Rest | None = None) -> None:
-        """Begins with a plant.
-
-        Args:
-            plant: The plant.
-            errors: Shapes of the error sets, (l, n, n).
-            D: Shape of the disturbance set, (n, n).
-            fixed: The resting point; the one that suits each gain by default.
-        """
-        self._plant, self._fixed = plant, fixed
+    def __init__(self, plant: LinearPlant, errors: np.ndarray, D: np.ndarray) -> None:
+        self._plant, self._fixed = plant, None if needs_resting_point(plant) else at_operating_point(plant)
         self._x, self._u = plant.half_widths, plant.input_half
         self._A, self._B = plant.A * self._x / self._x[:, None], plant.B * self._u / self._x[:, None]
         self._errors, self._D = errors / np.outer(self._x, self._x), D / np.outer(self._x, self._x)
@@ -110,7 +107,7 @@ class Tolerance:
         found = self._needs_and_slopes(self._scaled(K), slopes=False)
         return None if found is None else self._around(K, found[0])
 
-    def improved(self, K: np.ndarray, enough: float = np.inf) -> Tolerated | None:
+    def improved(self, K: np.ndarray) -> Tolerated | None:
         """Returns the gain of the largest margin near a given one: sequential quadratic programming, with derivatives.
 
         None if the given one is too slow. The margin s, its inverse being minimized, and the resting point x_c are
@@ -118,7 +115,6 @@ class Tolerance:
 
         Args:
             K: The given one, shape (m, n).
-            enough: The search ends once the margin is as large.
         """
         best = self.of(K)
         if best is None:
@@ -155,8 +151,6 @@ class Tolerance:
             tried = self.of(self._physical(z[: K.size].reshape(shape) * sizes))
             if tried is not None and best is not None and tried.margin > best.margin:
                 best = tried
-            if best is not None and best.margin >= enough:
-                raise StopIteration
 
         units = np.concatenate([self._x, self._u])
         at = np.linalg.lstsq(directions / units[:, None], np.concatenate(best.rest) / units, rcond=None)[0]
@@ -285,29 +279,19 @@ def invariant_ellipsoid(problem: DesignProblem, K: np.ndarray) -> InvariantEllip
         return at(np.round(best.x, _DIGITS))
 
 
-def tolerated_gains(
-    plant: LinearPlant, contract: ChannelContract | None, fixed: Rest | None = None, enough: float = np.inf
-) -> list[Tolerated]:
+def tolerated_gains(plant: LinearPlant, contract: ChannelContract | None) -> list[Tolerated]:
     """Returns gains with what they bear: the most tolerant one, and regulators.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract; None for none.
-        fixed: The resting point; the one that suits each gain by default.
-        enough: No more tolerant one is sought where one bears so much.
 
     Raises:
         Infeasible: If the plant has no error set, or no resting point.
     """
-    rest = fixed or farthest_from_limits(plant)
+    rest = farthest_from_limits(plant) if needs_resting_point(plant) else at_operating_point(plant)
     _, errors = design_problem(plant, contract, limits_around(plant, rest))
-    tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest), fixed)
+    tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest))
     pairs = zip(regulators(plant), regulators(plant, _FASTER), strict=False)
     gains = [found for K, faster in pairs if (found := tolerance.of(K) or tolerance.of(faster))]
     best = most_tolerant(gains)
-    if best is None or best.margin >= enough:
-        return gains
-    return [*filter(None, [tolerance.improved(best.K, enough)]), *gains]
+    return gains if best is None else [*filter(None, [tolerance.improved(best.K)]), *gains]
 
 
 def most_tolerant(gains: Sequence[Tolerated]) -> Tolerated | None:
@@ -315,22 +299,18 @@ def most_tolerant(gains: Sequence[Tolerated]) -> Tolerated | None:
     return max(gains, key=lambda each: each.margin, default=None)
 
 
-def most_tolerated(
-    plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool, enough: float = np.inf
-) -> Tolerated | None:
+def most_tolerated(plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool) -> Tolerated | None:
     """Returns the gain that bears the most of the radii, of a polytope or an ellipsoid; None if no gain stabilizes.
 
     Args:
         plant: The plant.
         contract: Channel contract, if there is one.
         polytope: Whether it is enough that it keeps a polytope.
-        enough: A factor beyond which no larger one is sought.
 
     Raises:
         Infeasible: If there is no error set, or no equilibrium within the limits.
     """
-    fixed = None if needs_resting_point(plant) else at_operating_point(plant)
-    gains = tolerated_gains(plant, contract, fixed, enough if polytope else np.inf)
+    gains = tolerated_gains(plant, contract)
     if not polytope:
         problem, _ = design_problem(plant, contract)
         pairs = [(each, invariant_ellipsoid(problem, each.K)) for each in gains]

@@ -16,7 +16,7 @@ from ncs_gym.plants.resting_point import MovedOperatingPointWarning
 from shields import CertificateError, Infeasible
 from shields.synthesis.invariant_polytope import feedback_of, points_of_box, share_of_points
 from shields.synthesis.tolerance import most_tolerated, tolerated_gains
-from tests.certificates import certificate_of, feasible_age_not_sought
+from tests.certificates import certificate_of
 from tests.product import altered, linear_plant, sampled_plant, synthesize, vector_shield
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import ANGLE, ASYMMETRIC, CHANNEL, CONTRACT, PLANTS, QUIET, certificate
@@ -368,37 +368,13 @@ def test_what_an_offset_lacks_of_an_equilibrium_by_rounding_is_in_the_bound():
     assert Fraction(float(plant.disturbance.shape_matrix[0, 0])) >= residual**2
 
 
-def test_resting_state_is_taken_where_it_is_one():
-    plant = ANGLE
-    state = np.array([0.1, 0.0])
-    found = synthesize(plant, contract=CONTRACT, resting_state=state)
-    np.testing.assert_array_equal(found.resting_state, state)
-    np.testing.assert_allclose(plant.A @ state + plant.B @ found.resting_input, state, atol=1e-12)
-    assert verified(found, plant).valid
-    symmetric = synthesize(within_symmetric(plant), contract=CONTRACT, resting_state=[0.05, 0.0])
-    assert symmetric.resting_state.tolist() == [0.05, 0.0]
-    assert verify_again(symmetric, within_symmetric(plant)).valid
-    for wrong, words in (
-        ([0.1, 0.1], "must be an equilibrium, and no input holds"),
-        ([0.9, 0.0], "strictly within the limits"),
-        ([0.1], "resting_state must have shape"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            synthesize(plant, contract=CONTRACT, resting_state=wrong)
-    rough = altered(plant, disturbance_bound=0.3)
-    with feasible_age_not_sought(), pytest.raises(Infeasible, match="around the resting_state that was given"):
-        synthesize(rough, contract=CONTRACT, resting_state=state)
-    with pytest.raises(ValueError, match="resting_state is given"):
-        synthesize(within_symmetric(plant), contract=CONTRACT, resting_state=[0.05, 0.0], safe_set="ellipsoid")
-
-
 def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monkeypatch):
     def failing(*arguments):
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
     monkeypatch.setattr("shields.synthesis.polytope_certificates._certified_polytope", failing)
     said = r"out of reach of float64 \(Matrix is not positive definite\): give states units"
-    with feasible_age_not_sought(), pytest.raises(Infeasible, match=said):
+    with pytest.raises(Infeasible, match=said):
         synthesize(ANGLE, contract=CONTRACT)
 
 

@@ -7,7 +7,7 @@ from ncs_gym import Channel, ChannelContract, truck_trailer
 from ncs_gym.estimation.error_bound import certified_error_set
 from shields import Infeasible, reach_of, verify
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
-from tests.certificates import certificate_of, feasible_age_not_sought
+from tests.certificates import certificate_of
 from tests.plants import NAMED, named, random_plant
 from tests.product import altered, library_plant, linear_plant, safety_shield, sampled_plant, synthesize
 from tests.verdicts import verified
@@ -83,7 +83,6 @@ def test_state_that_no_output_shows_is_named():
     system = ([[0.0, 1.0], [0.0, -0.5]], [[0.0], [1.0]], [[0.0, 1.0]], [[0.0]])
     plant = sampled_plant(system, **CART, state_names=("place", "speed"))
     with (
-        feasible_age_not_sought(),
         pytest.raises(Infeasible, match="no error set exists: the outputs do not show place, whose errors"),
     ):
         synthesize(plant, contract=ChannelContract(0))
@@ -120,7 +119,7 @@ def test_weak_input_is_what_binds():
     contract = ChannelContract(1)
     certificate = synthesize(with_limit(1.0), contract=contract, safe_set="ellipsoid")
     assert verified(certificate, with_limit(1.0)).valid
-    with feasible_age_not_sought(), pytest.raises(Infeasible) as caught:
+    with pytest.raises(Infeasible) as caught:
         synthesize(with_limit(1e-3), contract=contract)
     assert caught.value.binding == "U"
 
@@ -160,18 +159,17 @@ def test_solver_that_fails_gives_no_certificate_and_no_shield(monkeypatch, answe
         return program
 
     monkeypatch.setattr(cp.Problem, "solve", solve)
-    with feasible_age_not_sought():
-        with pytest.raises(Infeasible):
-            synthesize(plant, safe_set="ellipsoid")
-        if answer is not None:  # the others of these are as the first
-            return
-        oblique = library_plant(truck_trailer, box=OBLIQUE)
-        with pytest.raises(Infeasible):
-            safety_shield(gym.make("ncs_gym/TruckTrailer-v0", plant=oblique, channel=Channel()))
-        # A polytope of no other rows than the box's needs no such program.
-        assert verify(synthesize(plant), plant).valid
-        with pytest.raises(Infeasible, match="largest ellipsoid"):
-            synthesize(oblique)
+    with pytest.raises(Infeasible):
+        synthesize(plant, safe_set="ellipsoid")
+    if answer is not None:  # the others of these are as the first
+        return
+    oblique = library_plant(truck_trailer, box=OBLIQUE)
+    with pytest.raises(Infeasible):
+        safety_shield(gym.make("ncs_gym/TruckTrailer-v0", plant=oblique, channel=Channel()))
+    # A polytope of no other rows than the box's needs no such program.
+    assert verify(synthesize(plant), plant).valid
+    with pytest.raises(Infeasible, match="largest ellipsoid"):
+        synthesize(oblique)
 
 
 @pytest.mark.slow
@@ -189,8 +187,7 @@ def test_solver_whose_answers_are_a_little_wrong_gives_no_false_certificate(n, m
 
     monkeypatch.setattr(cp.Problem, "solve", solve)
     try:
-        with feasible_age_not_sought():
-            certificate = synthesize(plant, safe_set="ellipsoid")
+        certificate = synthesize(plant, safe_set="ellipsoid")
     except Infeasible:
         return
     assert verified(certificate, plant).valid
