@@ -23,32 +23,21 @@ def with_literal_numbers(text: str) -> Any:
 
 
 def document_of(kind: str, format_name: str, content: Any) -> dict[str, Any]:
-    """Returns the document of some content, whose checksum counts every digit.
-
-    Args:
-        kind: What the content is, the key of the document that holds it.
-        format_name: Name of the format, with its version.
-        content: JSON values.
-    """
+    """Returns the document that holds JSON values under the key `kind`; its checksum counts every digit."""
     literal = with_literal_numbers(json.dumps(content))
     return {"format": format_name, "sha256": digest(literal), kind: content}
 
 
 def write_document(path: str | os.PathLike[str], document: dict[str, Any]) -> None:
-    """Writes a document; a reader never sees a part of it.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Writes a document; a reader never sees a part of it. Raises OSError if the file cannot be written."""
     write_atomically(Path(path), json.dumps(document, indent=1) + "\n")
 
 
 def read_content(path: str | os.PathLike[str], kind: str, format_name: str) -> Any:
-    """Returns the content of the document in a file, after comparing its checksum; for arguments see `document_of`.
+    """Returns the content of the document in a file, after comparing its checksum.
 
     Raises:
-        ValueError: If the file is missing, no JSON or larger than documents may be (`ncs_gym.reading`), of another kind
-            or format, or altered; the message says which.
+        ValueError: If the file is missing, no JSON, too large, of another kind or format, or altered.
     """
     try:
         text = read_text(path)

@@ -48,19 +48,18 @@ class WayBack(NamedTuple):
 
 @dataclass(frozen=True)
 class Silence:
-    """What is known in advance of silences that exceed the contract of a certificate.
+    """What is known in advance of silences that exceed the contract of a certificate; printed, it says so in words.
 
-    `print(silence)` says it in words. Behind a downlink commands must keep arriving as its contract says.
+    Behind a downlink commands must keep arriving as its contract says.
 
     Attributes:
         max_age: Steps that the newest sample may be old under the contract, with what a downlink takes of them.
         dt: Duration of a step [s]; None for a plant that has none.
-        anywhere: For how many steps more the box is kept from any belief that the contract allows, whatever the agent
-            and the disturbance do (every mode of a shield but "monitor").
-        at_half: For how many steps more it is kept with the fallback input, from an estimate in half of the safe set,
-            which is made smaller around its resting point. The state itself may be outside the set then, so that with
-            large errors this may be less than `anywhere`.
-        at_rest: The same from an estimate at the resting point. All three are at most `MOST_STEPS`.
+        anywhere: For how many steps more, at most `MOST_STEPS`, the box is kept from any belief that the contract
+            allows, whatever the agent and the disturbance do (every mode of a shield but "monitor").
+        at_half: The same with the fallback input, from an estimate in half of the safe set around its resting point;
+            the state itself may be outside then.
+        at_rest: The same from an estimate at the resting point.
         ways_back: How the guarantee returns after outages.
     """
 
@@ -98,7 +97,7 @@ def silence_of(certificate: Certificate, plant: LinearPlant, input_delay: int = 
 
     Args:
         certificate: Verified exactly here.
-        plant: The plant it was made for.
+        plant: Its plant.
         input_delay: What a downlink takes of the contract's age [steps], as `NCSEnv.downlink_protocol` says.
 
     Raises:
@@ -128,10 +127,6 @@ class _Fallbacks:
 
     so that a limit r y_j + s u_j with u_j = K y_hat_j is a sum of supports: of S for y_0, and of E(Sigma) and E(D). If
     the resting point is no equilibrium, sum_{i<j} (A + B K)^i (A x_c + B u_c - x_c) is added to y_hat_j.
-
-    Args:
-        certificate: Gives S, K and the error set of the oldest sample.
-        plant: Gives A, B, D and the limits.
     """
 
     def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
@@ -210,7 +205,7 @@ class _Fallbacks:
 
 
 def _powers(matrix: np.ndarray) -> np.ndarray:
-    """Returns the powers of a matrix up to `MOST_STEPS`, shape (MOST_STEPS + 1, n, n)."""
+    """Returns shape (MOST_STEPS + 1, n, n)."""
     powers = [np.eye(len(matrix))]
     for _ in range(MOST_STEPS):
         powers.append(matrix @ powers[-1])

@@ -47,10 +47,10 @@ class Definition1Filter:
         self._samples: list[np.ndarray | None] = []
 
     def advance(self, u: np.ndarray, samples: np.ndarray | None, arrivals: list[tuple[int, np.ndarray]]) -> None:
-        """Moves one step on.
+        """Moves one step on; Definition 1 predicts with G, so the inputs u are not used.
 
         Args:
-            u: Applied inputs, shape (m, N); not used, because Definition 1 predicts with G.
+            u: Applied inputs, shape (m, N).
             samples: What was measured at this step, shape (p, N); None if nobody sends.
             arrivals: Ages of samples that arrive now, each with the episodes, shape (N,).
         """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,7 +16,6 @@ from shields.synthesis.alternating_optimization import largest_set, with_best_ga
 from shields.synthesis.certificate_fields import certificate_of
 from shields.synthesis.design_problem import CandidateDesign, SymmetricLimits, design_problem
 from shields.synthesis.invariant_polytope import feedback_of, limits_within_step
-from shields.synthesis.multipliers import with_best_multipliers
 from shields.synthesis.search import Search
 from shields.synthesis.tolerance import Tolerated
 from shields.verification import Report, verify
@@ -34,29 +32,6 @@ MORE_DIGITS = (
 _BETWEEN_MARGIN, _MOST_BOXES = 1e-3, 8
 # Where no set is found, half-widths of the box that differ by more are named as the reason.
 _WIDEST_SPREAD = 1e6
-# Multipliers from which those of a given set and gain are sought.
-_INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
-
-
-def certify(
-    plant: LinearPlant, L: np.ndarray, K: np.ndarray, contract: ChannelContract | None = None
-) -> Certificate | None:
-    """Returns a verified certificate for a given set and gain; None if no multipliers that prove it are found.
-
-    Args:
-        plant: The plant with its bounds.
-        L: Shape of the safe set, (n, n).
-        K: Gain, shape (m, n) [input per state].
-        contract: Channel contract; with one, the error sets depend on the age of the newest sample.
-
-    Raises:
-        Infeasible: If the plant has no error set or its safe box is unbounded.
-    """
-    problem, errors = design_problem(plant, contract)
-    given = CandidateDesign(*problem.to_scaled(L, K), _INITIAL_MULTIPLIERS, np.empty(0))
-    design = with_best_multipliers(problem, given, problem.error_shapes)
-    certificate = replace(certificate_of(plant, problem, design, errors), L=L, K=K)
-    return certificate if verify(certificate, plant).valid else None
 
 
 def largest_ellipsoid(
@@ -92,7 +67,7 @@ def largest_ellipsoid(
         report = verify(candidate, plant)
         if report.valid:
             return candidate
-        raise _failed_verification(report)
+        raise failed_verification(report)
     if (widest := float(np.abs(box_rows).max() / np.abs(plant.box_rows).max())) > 1.0:
         raise _leaves_between_samples(widest - 1.0)  # there is a set in the plant's own box
     if (spread := float(plant.half_widths.max() / plant.half_widths.min())) > _WIDEST_SPREAD:
@@ -137,7 +112,7 @@ def _over_between_samples(certificate: Certificate, plant: LinearPlant) -> np.nd
         return np.ones(len(plant.box_rows))
     if grid.high.min() <= 0.0:
         raise _leaves_between_samples(1.0)
-    reach = np.sqrt(((grid.images @ certificate.L) * grid.images).sum(axis=1)) / grid.high
+    reach = np.sqrt(((grid.rows @ certificate.L) * grid.rows).sum(axis=1)) / grid.high
     over = reach.reshape(-1, len(plant.box_rows)).max(axis=0)
     left = over.max() > 1.0 - 0.1 * _BETWEEN_MARGIN
     return np.maximum(over / (1.0 - _BETWEEN_MARGIN), 1.0) if left else np.ones(len(over))
@@ -153,7 +128,7 @@ def _leaves_between_samples(shortfall: float) -> Infeasible:
     )
 
 
-def _failed_verification(report: Report) -> Infeasible:
+def failed_verification(report: Report) -> Infeasible:
     """Returns the exception for a candidate that does not verify."""
     failed = next(condition for condition in report.conditions if not condition.holds)
     return Infeasible(

@@ -20,7 +20,6 @@ from shields.synthesis.resting_point import (
     disturbance_around,
     equilibria,
     farthest_equilibrium,
-    farthest_from_limits,
     limit_rows,
     limits_around,
     needs_resting_point,
@@ -50,9 +49,9 @@ _EVALUATIONS, _LARGEST_LOGIT = 100, 12.0
 
 
 def regulators(plant: LinearPlant, decay: float = 1.0) -> list[np.ndarray]:
-    """Returns the gains, shape (m, n), of linear-quadratic regulators that use less and less of the inputs.
+    """Returns gains, (m, n), of linear-quadratic regulators with eigenvalues up to `decay` and less and less input.
 
-    Limits of states and inputs together cost as inputs do. Eigenvalues are at most `decay`.
+    Limits of states and inputs together cost as inputs do.
     """
     A, B = plant.A / decay, plant.B / decay
     state, pushed = plant.mixed_rows[:, : plant.n], plant.mixed_rows[:, plant.n :]
@@ -69,7 +68,7 @@ class Tolerated(NamedTuple):
 
     Attributes:
         K: The gain, shape (m, n).
-        rest: The resting point that suits it.
+        rest: Its resting point.
         margin: The factor.
         binding: The limits that are reached first, numbers of `limit_rows`.
     """
@@ -83,10 +82,10 @@ class Tolerated(NamedTuple):
 class Tolerance:
     """What radii a gain bears.
 
-    From rest errors and disturbances take a limited quantity c x at most as far as the sum of their supports, step by
-    step, by what the closed loop makes of the row c. Where that stays within all limits, the states that stay in them
-    for ever are a set around the resting point (Kolmanovsky and Gilbert 1998, docs/bibliography.md); elsewhere there is
-    none. The resting point is the operating point where limits are symmetric, else the one that suits each gain.
+    From rest errors and disturbances take a limited quantity c x as far as the sum of their supports along the rows
+    that the closed loop makes of c, step by step. Where that stays within all limits, the states that stay in them for
+    ever are a set around the resting point (Kolmanovsky and Gilbert 1998, docs/bibliography.md), else none is. The
+    resting point is the operating point where limits are symmetric, else the one that suits each gain.
 
     Args:
         plant: The plant.
@@ -108,13 +107,10 @@ class Tolerance:
         return None if found is None else self._around(K, found[0])
 
     def improved(self, K: np.ndarray) -> Tolerated | None:
-        """Returns the gain of the largest margin near a given one: sequential quadratic programming, with derivatives.
+        """Returns the gain of the largest margin near a given one, by sequential quadratic programming.
 
-        None if the given one is too slow. The margin s, its inverse being minimized, and the resting point x_c are
-        variables: what a gain needs, and x_c / s, stay within the limits times 1 / s.
-
-        Args:
-            K: The given one, shape (m, n).
+        None if the given one, shape (m, n), is too slow. The inverse 1 / s of the margin is minimized, the resting
+        point x_c is a variable, too: what a gain needs, and x_c / s, stay within the limits times 1 / s.
         """
         best = self.of(K)
         if best is None:
@@ -188,7 +184,7 @@ class Tolerance:
     def _needs_and_slopes(self, K: np.ndarray, *, slopes: bool = True) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns how far errors and disturbances take every limit from rest under a scaled gain, in half ranges, (r,).
 
-        The second are the derivatives, shape (r, m, n), if they are asked for. None if the gain is too slow to tell.
+        With the derivatives, (r, m, n), if they are asked for. None if the gain is too slow to tell.
         """
         closed_loop, answer = self._A + self._B @ K, self._B @ K
         first = self._state + self._input @ K
@@ -285,7 +281,7 @@ def tolerated_gains(plant: LinearPlant, contract: ChannelContract | None) -> lis
     Raises:
         Infeasible: If the plant has no error set, or no resting point.
     """
-    rest = farthest_from_limits(plant) if needs_resting_point(plant) else at_operating_point(plant)
+    rest = farthest_equilibrium(plant).rest if needs_resting_point(plant) else at_operating_point(plant)
     _, errors = design_problem(plant, contract, limits_around(plant, rest))
     tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest))
     pairs = zip(regulators(plant), regulators(plant, _FASTER), strict=False)
@@ -300,15 +296,10 @@ def most_tolerant(gains: Sequence[Tolerated]) -> Tolerated | None:
 
 
 def most_tolerated(plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool) -> Tolerated | None:
-    """Returns the gain that bears the most of the radii, of a polytope or an ellipsoid; None if no gain stabilizes.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract, if there is one.
-        polytope: Whether it is enough that it keeps a polytope.
+    """Returns the gain that bears the most of the radii with a polytope, or else an ellipsoid; None if none stabilizes.
 
     Raises:
-        Infeasible: If there is no error set, or no equilibrium within the limits.
+        Infeasible: If the plant has no error set, or no resting point.
     """
     gains = tolerated_gains(plant, contract)
     if not polytope:

@@ -17,7 +17,8 @@ from ncs_gym.network.channel import in_time
 from shields import CertificateError, certificate_for
 from shields.silence import MOST_STEPS, way_back
 from shields.synthesis.faces import Extremes, Faces
-from shields.synthesis.polytope_certificates import certify_polytope
+from shields.synthesis.polytope_certificates import certified_polytope
+from shields.synthesis.resting_point import at_operating_point
 from tests.certificates import certificate_of
 from tests.plants import named, small
 from tests.product import altered, linear_plant, sampled_plant, vector_env, vector_shield
@@ -169,7 +170,8 @@ def test_a_resting_point_that_is_no_equilibrium_moves_the_estimate():
     bounds = {"sensor_bound": 0.003, "initial_bound": 0.003}
     given = {"A": [[1.02, 0.05], [0.0, 0.9]], "B": [[0.1], [0.2]], "box": np.eye(2), "dt": 0.1, "u_max": 2.0}
     plant, wide = (linear_plant(**given, **bounds, disturbance_bound=each) for each in (0.001, 0.005))
-    found, x_c = certify_polytope(wide, np.array([[-0.87, -0.75]]), ChannelContract(3)), np.array([0.1, 0.0])
+    rest, x_c = at_operating_point(wide), np.array([0.1, 0.0])
+    found = certified_polytope(wide, np.array([[-0.87, -0.75]]), ChannelContract(3), rest)
     moved = replace(
         found,
         fingerprint=plant.fingerprint,

@@ -14,7 +14,8 @@ from ncs_gym.plants.batch_reactor import batch_reactor
 from shields import Infeasible
 from shields.synthesis import polytope_certificates
 from shields.synthesis.invariant_polytope import share_in_polytope
-from shields.synthesis.polytope_certificates import certify_polytope
+from shields.synthesis.polytope_certificates import certified_polytope
+from shields.synthesis.resting_point import at_operating_point
 from shields.synthesis.tolerance import Tolerance, most_tolerated, regulators
 from shields.verification import verify
 from tests.certificates import certificate_of
@@ -81,9 +82,10 @@ def test_margin_of_a_gain_is_what_errors_and_disturbances_reach_together(seed):
             used += max(np.sqrt(row @ S @ row) for S in errors)
         reached.append(used)
     assert 1.0 / max(reached) == pytest.approx(margin, rel=1e-6)
-    certified = [certify_polytope(with_radii(plant, f * margin), K, AGE) for f in (0.99, 1.02)]
-    assert certified[0] is not None
-    assert certified[1] is None
+    rest = at_operating_point(plant)
+    assert certified_polytope(with_radii(plant, 0.99 * margin), K, AGE, rest)
+    with pytest.raises(Infeasible):
+        certified_polytope(with_radii(plant, 1.02 * margin), K, AGE, rest)
 
 
 @pytest.mark.parametrize("make", [lambda: servo(1.0), lambda: servo(1.0, between_samples=4), batch_reactor])
@@ -123,7 +125,7 @@ def test_polytope_that_fails_the_exact_check_is_sought_with_a_larger_margin(monk
         return verify(certificate if len(checked) > 1 else replace(certificate, K=2.0 * certificate.K), plant)
 
     monkeypatch.setattr(polytope_certificates, "verify", strict)
-    found = certify_polytope(plant, most_tolerated(plant, AGE, polytope=True).K, AGE)
+    found = certified_polytope(plant, most_tolerated(plant, AGE, polytope=True).K, AGE, at_operating_point(plant))
     assert verified(found, plant).valid
     assert len(checked) == 2
     assert share_in_polytope(found.polytope, plant) <= share_in_polytope(checked[0].polytope, plant)

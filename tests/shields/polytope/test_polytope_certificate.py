@@ -21,7 +21,8 @@ from shields import verify
 from shields.errors import Infeasible
 from shields.polytope import Polytope
 from shields.synthesis import invariant_polytope as search
-from shields.synthesis.polytope_certificates import certify_polytope, with_polytope
+from shields.synthesis.polytope_certificates import certified_polytope, with_polytope
+from shields.synthesis.resting_point import at_operating_point
 from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
@@ -78,9 +79,7 @@ def test_units_of_inputs_do_not_matter():
     certificate = certificate_of(plant)
     tiny = altered(plant, B=plant.B * 1e39, u_max=plant.u_max * 1e-39)
     K = certificate.K * 1e-39
-    found_there = next(
-        search.invariant_polytopes(search.feedback_of(replace(certificate, K=K)), tiny, lambda line: None)
-    )
+    found_there = search.invariant_polytope(search.feedback_of(replace(certificate, K=K)), tiny, search.MARGINS[0])
     broken = [
         [c.name for c in judge(replace(certificate, K=K, polytope=found_there), tiny).conditions
          if not c.holds and c.name.startswith("(P")]
@@ -191,7 +190,7 @@ def slow_plant():
 def test_polytope_of_too_many_rows_is_replaced_by_a_coarser_one_that_is_nearly_as_large(monkeypatch):
     plant, lines = slow_plant(), []
     monkeypatch.setattr(search, "MOST_ROWS", 12)
-    found = certify_polytope(plant, np.zeros((1, 3)), progress=lines.append)
+    found = certified_polytope(plant, np.zeros((1, 3)), None, at_operating_point(plant), lines.append)
     assert sum("more than 12 rows" in line for line in lines) == 3
     assert len(found.polytope.rows) <= 12
     assert verified(found, plant).valid
@@ -214,7 +213,7 @@ def test_errors_that_leave_a_face_alone_leave_no_polytope():
     certificate = certificate_of(plant)
     wide = replace(certificate, proofs=(replace(certificate.proofs[0], Sigma=1e4 * certificate.Sigma),))
     with pytest.raises(Infeasible):
-        next(search.invariant_polytopes(search.feedback_of(wide), plant, lambda line: None))
+        search.invariant_polytope(search.feedback_of(wide), plant, search.MARGINS[0])
 
 
 def test_search_for_a_polytope_that_is_ended_leaves_the_ellipsoid():

@@ -14,7 +14,6 @@ from benchmarks.published import channel_of, contract_of_plant, plant_of, publis
 from ncs_gym import AdversarialDisturbance, ChannelContract, contract_of
 from ncs_gym.plants.resting_point import MovedOperatingPointWarning
 from shields import CertificateError, Infeasible
-from shields.synthesis.invariant_polytope import feedback_of, points_of_box, share_of_points
 from shields.synthesis.tolerance import most_tolerated, tolerated_gains
 from tests.certificates import certificate_of
 from tests.product import altered, linear_plant, sampled_plant, synthesize, vector_shield
@@ -87,30 +86,6 @@ def test_share_of_the_box_is_that_of_random_points(name):
     inside = ((P.low <= points @ P.rows.T) & (points @ P.rows.T <= P.high)).all(axis=1)
     assert found.provenance["polytope_share_of_box"] == pytest.approx(inside.mean(), abs=0.02)
     assert inside.mean() > 0.5
-
-
-def test_share_of_the_last_input_is_what_linear_programs_find():
-    plant = linear_plant(
-        A=[[0.9, 0.0], [0.095, 0.92]], B=[[0.114], [0.006]], dt=2.0, box=[10.0, 10.0], u_max=5.0, du_max=1.0,
-        disturbance_bound=[0.1, 0.05], sensor_bound=0.1, initial_bound=[0.3, 0.2],
-    )  # fmt: skip
-    found = synthesize(plant)
-    P = found.polytope
-    faces, ends = np.concatenate([P.rows, -P.rows]), np.concatenate([P.high, -P.low])
-    bounds = [*(plant.n - 1) * [(None, None)], tuple(plant.input_ends[:, 0].tolist())]
-    last = np.eye(plant.n)[-1]
-    least, most = (
-        linprog(sign * last, faces[np.isfinite(ends)], ends[np.isfinite(ends)], bounds=bounds) for sign in (1.0, -1.0)
-    )
-    share = (-most.fun - least.fun) / np.ptp(plant.input_ends)
-    assert found.provenance["share_of_last_input"] == pytest.approx(share, abs=0.002)
-    assert f"the last input has {100.0 * share:.3g} % of its range" in " ".join(str(found).split())
-    # Gains are compared by points of states and of last inputs: these decide as much of the next state as those.
-    points = points_of_box(plant, 12)
-    inside = ((P.low <= points @ P.rows.T) & (points @ P.rows.T <= P.high)).all(axis=1)
-    assert np.ptp(points[:, -1]) == pytest.approx(np.ptp(plant.input_ends), rel=0.001)
-    assert share_of_points(feedback_of(found), plant, points) == pytest.approx(inside.mean(), abs=0.002)
-    assert 0.3 < inside.mean() < found.provenance["polytope_share_of_box"]
 
 
 def changed(found, **fields):
@@ -372,7 +347,7 @@ def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monk
     def failing(*arguments):
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
-    monkeypatch.setattr("shields.synthesis.polytope_certificates._certified_polytope", failing)
+    monkeypatch.setattr("shields.synthesis.polytope_certificates.certified_polytope", failing)
     said = r"out of reach of float64 \(Matrix is not positive definite\): give states units"
     with pytest.raises(Infeasible, match=said):
         synthesize(ANGLE, contract=CONTRACT)

@@ -161,10 +161,11 @@ def test_provenance_proves_nothing_and_the_fingerprint_names_the_plant(name):
 
 def with_multipliers(certificate, **change):
     """A certificate without a contract with other multipliers."""
-    moved = replace(certificate.multipliers, **change)
-    shares = moved.state, moved.estimate, moved.disturbance
-    changed = with_proof(certificate, rate=moved.error, shares=shares, inputs=moved.inputs)
-    return replace(changed, rounding=moved.rounding)
+    proof, names = certificate.proofs[-1], ("state", "estimate", "disturbance")
+    shares = [change.get(name, share) for name, share in zip(names, proof.shares.tolist(), strict=True)]
+    rate, inputs = change.get("error", proof.rate), change.get("inputs", proof.inputs)
+    changed = with_proof(certificate, rate=rate, shares=shares, inputs=inputs)
+    return replace(changed, rounding=change.get("rounding", certificate.rounding))
 
 
 SOURCES = {"disturbance": "disturbance", "sensor": "sensor", "initial": "first_error"}
@@ -257,9 +258,9 @@ OF_CERTIFICATE = [
     ("ellipsoid", "multipliers: 0 < lam_e < 1", lambda c: with_multipliers(c, inputs=(1.0,))),
     ("ellipsoid", "multipliers: lx, le, ld, s > 0", lambda c: with_multipliers(c, estimate=-1e-9)),
     ("ellipsoid", "multipliers: lx, le, ld, s > 0", lambda c: with_multipliers(c, rounding=0.0)),
-    ("ellipsoid", "multipliers: lx + le + ld", lambda c: with_multipliers(c, state=c.multipliers.state + 1e-8)),
+    ("ellipsoid", "multipliers: lx + le + ld", lambda c: with_multipliers(c, state=c.proofs[0].shares[0] + 1e-8)),
     ("ellipsoid", "D: the certificate's", lambda c: replace(c, D=(1 - 1.1e-9) * c.D)),
-    ("ellipsoid", "(E1)", lambda c: with_multipliers(c, error=0.5 * (1.0 + c.multipliers.error))),
+    ("ellipsoid", "(E1)", lambda c: with_multipliers(c, error=0.5 * (1.0 + c.proofs[0].rate))),
     ("ellipsoid", "(E1)", lambda c: with_multipliers(c, error=1e-320)),
     ("ellipsoid", "(I)", lambda c: with_multipliers(c, disturbance=1e-6)),
     ("ellipsoid", "(I)", lambda c: with_multipliers(c, state=1e-320)),

@@ -38,7 +38,7 @@ def test_margins_by_age_agree_with_floating_point(promised):
     margins = {c.name.split(" ")[0] + c.name[-1]: [] for c in verified(certificate, plant).conditions}
     for condition in verified(certificate, plant).conditions:
         margins[condition.name.split(" ")[0] + condition.name[-1]].append(condition.margin)
-    s, growth = certificate.updates, certificate.multipliers.rounding
+    s, growth = certificate.updates, certificate.rounding
     shapes = [*certificate.error_shapes, s.last]
     smallest = lambda matrix: np.linalg.eigvalsh(matrix)[0]  # noqa: E731
     assert margins["(C0)0"] == [pytest.approx(smallest(shapes[0] - plant.initial_error.shape_matrix), rel=1e-6)]

@@ -19,15 +19,15 @@ def test_margins_of_several_inputs_agree_with_floating_point():
     # Large limits and a small multiplier s, so that the rounding of actions counts in (I) and in (U).
     plant = altered(random_plant(3, 3, 2), u_max=[1e3, 2e3])
     certificate = with_multipliers(certificate_of(plant), rounding=1e-9)
-    c, s = certificate, certificate.multipliers
+    c, (lx, le, ld) = certificate, certificate.proofs[0].shares
     margins = {condition.name.split(" stays")[0]: condition.margin for condition in verified(c, plant).conditions}
     closed, gain = plant.A + plant.B @ c.K, plant.B @ c.K
     spread = 2 * plant.B @ np.diag((plant.u_max * 2.0**-24) ** 2) @ plant.B.T
-    D_u = (1 + s.rounding) * c.D + (1 + 1 / s.rounding) * spread
-    grown = closed @ c.L @ closed.T / s.state + gain @ c.Sigma @ gain.T / s.estimate + D_u / s.disturbance
+    D_u = (1 + c.rounding) * c.D + (1 + 1 / c.rounding) * spread
+    grown = closed @ c.L @ closed.T / lx + gain @ c.Sigma @ gain.T / le + D_u / ld
     invariance = next(value for name, value in margins.items() if name.startswith("(I)"))
     assert invariance == pytest.approx(np.linalg.eigvalsh(c.L - grown)[0], rel=1e-6)
-    for i, mu in enumerate(s.inputs):
+    for i, mu in enumerate(c.proofs[0].inputs):
         used = c.K[i] @ c.L @ c.K[i] / mu + c.K[i] @ c.Sigma @ c.K[i] / (1 - mu)
         limit = (plant.u_max[i] * (1 - 2.0**-24)) ** 2
         assert used > 1e-3 * c.K[i] @ c.L @ c.K[i]
