@@ -19,7 +19,6 @@ from tests.plants import named, servo
 from tests.product import altered, library_plant, linear_plant, paper_synthesis, synthesize
 
 SHARES = {"shares": np.array([0.9, 0.05, 0.05]), "inputs": np.array([0.5])}
-PAPER = {"kappa": 0.5, "rho": 1.2, "epsilon": 0.1, "epsilon_up": 0.2}
 
 
 def plant():

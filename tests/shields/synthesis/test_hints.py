@@ -13,7 +13,7 @@ from ncs_gym import ChannelContract, ErrorSetError
 from ncs_gym.estimation.error_bound import certified_error_set
 from shields import Infeasible
 from tests.plants import with_radii
-from tests.product import linear_plant, rate_limited, sampled_plant, synthesize
+from tests.product import linear_plant, rate_limited, synthesize
 from tests.verdicts import verified
 
 # A refusal takes so long at most [s of the processor].
@@ -91,24 +91,6 @@ def test_limits_that_bind_are_named():
     with pytest.raises(Infeasible, match=r"those that bind: 20 <= x1 <= 24 ") as told:
         synthesize(plant, contract=ChannelContract(2))
     assert told.value.__context__ is None  # one error with one percentage
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize(
-    ("seen", "limits"),
-    [
-        ([[0.0, 1.0, 0.0]], {"state_limits": ([-1.0, -1.0, -1.0], [2.0, 1.0, 1.0])}),
-        ([[0.0, 0.0, 1.0]], {"box": [1.0, 1.0, 1.0]}),
-    ],
-)
-def test_state_that_is_not_seen_is_named(seen, limits):
-    chain = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]
-    plant = sampled_plant(
-        (chain, [[0.0], [0.0], [1.0]], seen, 0), 0.1, u_max=1.0, disturbance_bound=1e-4,
-        state_names=("place", "speed", "acceleration"), **limits, **QUIET,
-    )  # fmt: skip
-    told = refusal(plant, ChannelContract(3))
-    assert "the outputs do not show place" in str(told)
 
 
 def test_error_sets_that_no_age_has_are_told_from_those_of_less_age():

@@ -15,7 +15,6 @@ from shields.synthesis.certification import first_certificate
 from shields.synthesis.network_requirements import share_of
 from shields.synthesis.search import Search
 from tests import plants
-from tests.product import synthesize
 from tests.shields.polytope.limits import certificate as limited
 
 
@@ -77,15 +76,6 @@ def test_less_than_what_was_refused_is_not_tried_and_more_than_what_is_certified
 @pytest.mark.slow
 def test_known_age_of_the_pendulum():
     assert requirements(pendulum(), ages=[8]).largest_age() == 8
-
-
-@pytest.mark.slow
-def test_shares_for_limits_with_two_ends_are_nearly_those_that_synthesis_keeps():
-    plant = plants.servo(1.0, box=None, state_limits=([-0.1, -4.0], [0.3, 4.0]))
-    found = requirements(plant, ages=[0, 4])
-    for age in found.ages:
-        kept = synthesize(plant, contract=ChannelContract(age)).provenance["polytope_share_of_box"]
-        assert share_of(found.certificate(age))[1] == pytest.approx(kept, abs=0.02)
 
 
 def test_share_is_that_of_what_shields_keep_and_of_open_boxes_none():
