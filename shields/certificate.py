@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid
+from ncs_gym.reading import read_text
 from ncs_gym.validation import FILLED_IN_LATER, ReadOnlyArrays, as_matrix, as_setting, as_vector, read_only, shown
 from shields.certificate_text import (
     contract_text,
@@ -22,7 +23,7 @@ from shields.certificate_text import (
     table,
 )
 from shields.errors import CertificateError
-from shields.json_documents import content_of, document_of, read_content, write_document
+from shields.json_documents import content_of, document_of, write_document
 from shields.polytope import Polytope, polytope_content, polytope_of
 
 _FORMAT = "ncs-gym certificate 3"
@@ -312,11 +313,7 @@ class Certificate(ReadOnlyArrays):
         return f"u = u_c + K (x_hat - x_c), with x_c = ({x_c}) and u_c = ({u_c}) from the operating point"
 
     def without_polytope(self) -> Certificate:
-        """Returns the certificate of the ellipsoid alone.
-
-        Raises:
-            CertificateError: If it does not keep the ellipsoid.
-        """
+        """Returns the certificate of the ellipsoid alone; raises CertificateError if it does not keep the ellipsoid."""
         of_polytopes = ("polytope_share_of_box", "no_polytope", "reach")
         kept = {name: value for name, value in self.provenance.items() if name not in of_polytopes}
         return replace(self, polytope=None, provenance=kept)
@@ -336,14 +333,14 @@ class Certificate(ReadOnlyArrays):
         Raises:
             CertificateError: If the document or file is missing, damaged or altered.
         """
-        if isinstance(given, cls):
+        if isinstance(given, Certificate):
             return given
-        is_document = isinstance(given, Mapping)
+        name = "document" if isinstance(given, Mapping) else given
         try:
-            if is_document:
-                content = content_of(json.dumps(given), "document", "certificate", _FORMAT)
-            else:
-                content = read_content(given, "certificate", _FORMAT)  # pyright: ignore[reportArgumentType]
+            text = json.dumps(given) if isinstance(given, Mapping) else read_text(given)
+            content = content_of(text, name, "certificate", _FORMAT)
+        except OSError as error:
+            raise CertificateError(f"cannot read certificate {name}: {error.strerror}") from error
         except (TypeError, ValueError, RecursionError) as error:
             raise CertificateError(str(error)) from error
         try:
@@ -351,7 +348,6 @@ class Certificate(ReadOnlyArrays):
         except CertificateError:
             raise
         except (KeyError, TypeError, ValueError) as error:
-            name = "the document" if is_document else given
             raise CertificateError(f"{name} is not a certificate: an entry is missing or of a wrong kind") from error
 
     @classmethod

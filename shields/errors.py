@@ -22,15 +22,13 @@ class Infeasible(ValueError):
     """No certificate was found.
 
     Attributes:
-        binding: Name of the condition that cannot be met: "E1" (there is no error bound), "S" (the safe box is
-            unbounded), "U" (the input limits), "I" (invariance), "P" (a gain bears all, but its polytope was not
-            found), "R" (it has too many rows), or "T" (`time_limit` was over before anything was found); where a
-            candidate failed in exact verification only, the condition it failed. For method "paper": "C2", "C1", "C5"
-            (the input limit), or "grid" if OP is feasible but not at a point of the search grid.
+        binding: Name of the condition that cannot be met: "E1" (there is no error bound), "S" (the safe box), "U" (the
+            input limits), "I" (invariance), "P" (a gain bears all, but its polytope was not found), "R" (it has too
+            many rows), or "T" (`time_limit` was over before anything was found); where a candidate failed in exact
+            verification only, the condition it failed. "OP" for the published method.
         shortfall: By how much the condition fails: for "E1" the excess of the spectral radius over 1; for "I" and "U"
-            the fraction, in (0, 1], by which the radii of disturbance and estimation error must shrink; for "S" the
-            number of unbounded directions; for "C2" 1 - lambda_min(L)/alpha; where only exact verification failed, the
-            violation of that condition.
+            the fraction, in (0, 1], by which the radii of disturbance and estimation error must shrink; where only
+            exact verification failed, the violation of that condition.
     """
 
     def __init__(self, message: str, binding: str, shortfall: float) -> None:

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from ncs_gym.reading import json_values, read_text
+from ncs_gym.reading import json_values
 from shields.atomic_write import write_atomically
 
 
@@ -33,22 +33,12 @@ def write_document(path: str | os.PathLike[str], document: dict[str, Any]) -> No
     write_atomically(Path(path), json.dumps(document, indent=1) + "\n")
 
 
-def read_content(path: str | os.PathLike[str], kind: str, format_name: str) -> Any:
-    """Returns the content of the document in a file, after comparing its checksum.
+def content_of(text: str, path: Any, kind: str, format_name: str) -> Any:
+    """Returns the content of a document, which messages call `path`, after comparing its checksum.
 
     Raises:
-        ValueError: If the file is missing, no JSON, too large, of another kind or format, or altered.
+        ValueError: If it is no JSON, of another kind or format, or altered.
     """
-    try:
-        text = read_text(path)
-    except (OSError, TypeError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it is not valid JSON"
-        raise ValueError(f"cannot read {kind} {path}: {reason}") from error
-    return content_of(text, path, kind, format_name)
-
-
-def content_of(text: str, path: Any, kind: str, format_name: str) -> Any:
-    """Returns what `read_content` does, of the text of a document, which messages call `path`."""
     try:
         document, literal = json_values(text), with_literal_numbers(text)
     except (TypeError, ValueError, RecursionError) as error:

@@ -94,13 +94,7 @@ def worst_step(
     """Returns the step from {x'Mx <= 1} that ends at the largest x+'M x+.
 
     It is found by ascent from random slopes: for a fixed slope M x+ each of x, d, e is the extreme point of its set.
-
-    Args:
-        closed: A + B K, shape (n, n).
-        M: Matrix of the set, shape (n, n).
-        disturbances: The set of d.
-        errors: The set of e.
-        starts: Number of random slopes.
+    `closed` is A + B K, shape (n, n).
     """
     inverse = np.linalg.inv(M)
     states = Ellipsoid(0.5 * (inverse + inverse.T))

@@ -38,7 +38,7 @@ def largest_set(
     Args:
         problem: The scaled design problem.
         slack: Relative tightening of the conditions.
-        report: Called with the stage and the best design so far, at the initial design and per alternation.
+        report: Called with the stage and the best design so far.
         gains: Gains in physical units, shape (m, n), of which one has the initial design.
     """
     program = InvariantSetProgram(problem, slack)

@@ -13,7 +13,7 @@ from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.synthesis.diagnosis import infeasibility, with_limits_out_of_proportion
 from shields.synthesis.ellipsoid_certificates import largest_ellipsoid
-from shields.synthesis.polytope_certificates import around_resting_point, with_polytope
+from shields.synthesis.polytope_certificates import around_resting_point, reason_of, with_polytope
 from shields.synthesis.resting_point import needs_resting_point
 from shields.synthesis.search import Progress, Search
 from shields.synthesis.tolerance import most_tolerated, tolerated_gains
@@ -80,12 +80,6 @@ def first_certificate(
 
     Where most states are past inputs, a polytope alone comes first: an ellipsoid takes minutes there and adds nothing.
 
-    Args:
-        plant: The plant.
-        contract: Channel contract; None for none.
-        search: Is told the stages, and holds the best candidate.
-        polytope: Whether a polytope alone would do.
-
     Raises:
         Infeasible: If none is found.
         TimeoutError: If the time of the search is over.
@@ -111,4 +105,6 @@ def first_certificate(
         failure = failure or infeasibility(plant, most_tolerated(plant, contract, polytope=False), polytope=False)
     except Infeasible as none:
         failure = none
+    except np.linalg.LinAlgError as error:
+        failure = Infeasible(reason_of(error), "S", 1.0)
     raise with_limits_out_of_proportion(failure, plant)

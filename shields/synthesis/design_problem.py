@@ -22,10 +22,6 @@ INFLATION = 1.0 + 1e-9
 # Axes of an error set are lengthened to at least this fraction of its longest one in the semidefinite programs; exact
 # verification uses the error set itself.
 _SMALLEST_AXIS_RATIO = 0.01
-# A box that is longer in one direction than in another by more, each state in units of its own limit, is refused.
-_FLATTEST = 1e7
-# Of the longest direction those states are named whose part in it is at least this much of the largest one.
-_SHARE_OF_DIRECTION = 0.1
 
 
 class Rest(NamedTuple):
@@ -110,11 +106,6 @@ class DesignProblem:
         shape = self.transform @ L @ self.transform.T
         return 0.5 * (shape + shape.T), np.diag(self.u_max) @ np.linalg.solve(self.transform.T, K.T).T
 
-    def to_scaled(self, L: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns L (n, n) and K (m, n) in scaled coordinates."""
-        inverse = np.linalg.inv(self.transform)
-        return inverse @ L @ inverse.T, (K @ self.transform) / self.u_max[:, None]
-
 
 @dataclass(frozen=True, eq=False)
 class CandidateDesign:
@@ -143,26 +134,12 @@ def design_problem(
 ) -> tuple[DesignProblem, ErrorSet]:
     """Returns the scaled design problem, and the error set with its shapes a little larger than the environment's.
 
-    Args:
-        plant: The plant.
-        contract: Channel contract; None for none.
-        limits: Limits within which the set is sought; the plant's own by default.
+    The set is sought within `limits`, by default the plant's own.
 
     Raises:
-        Infeasible: If the plant has no error set, or its safe box is flat, or far too wide for times between samples.
+        Infeasible: If the plant has no error set, or its safe box is far too wide for times between samples.
     """
     limits = SymmetricLimits(plant.box_rows, plant.u_max) if limits is None else limits
-    _, sizes, directions = np.linalg.svd(limits.box_rows * plant.half_widths)
-    flatness = float(sizes[0] / sizes[-1])
-    if flatness > _FLATTEST:
-        large = np.flatnonzero(np.abs(directions[-1]) > _SHARE_OF_DIRECTION * np.abs(directions[-1]).max())
-        names = " or ".join(plant.state_names[j] for j in large.tolist())
-        raise Infeasible(
-            f"the safe box is flat, {flatness:.0e} times longer in one direction than in another that is no axis: add "
-            f"a limit of {names}, along which it is long, or leave out those that limit the short one",
-            "S",
-            flatness,
-        )
     try:
         _ = plant.grid_rows
     except OverflowError as error:
@@ -180,11 +157,6 @@ def design_problem(
         ) from error
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
-    return _scaled(plant, errors.promised, limits), errors
-
-
-def _scaled(plant: LinearPlant, error_shapes: np.ndarray, limits: SymmetricLimits) -> DesignProblem:
-    """Returns the design problem for error sets (k, n, n), in the largest ellipsoid within the limits."""
     box_rows, u_max = limits
     box = largest_box_ellipsoid(box_rows)
     T = np.linalg.cholesky(box)
@@ -196,16 +168,17 @@ def _scaled(plant: LinearPlant, error_shapes: np.ndarray, limits: SymmetricLimit
     s = float(exact.rounded(np.sqrt(np.clip(ratio, 1e-16, 1.0)), 6))
     inverse = np.linalg.inv(T)
     D_u = (1.0 + s) * D + (1.0 + 1.0 / s) * rounding
-    return DesignProblem(
+    problem = DesignProblem(
         A=inverse @ plant.A @ T,
         B=inverse @ plant.B @ np.diag(u_max),
         C=box_rows @ T,
         D_u=inverse @ D_u @ inverse.T,
-        error_shapes=inverse @ error_shapes @ inverse.T,
+        error_shapes=inverse @ errors.promised @ inverse.T,
         transform=T,
         u_max=u_max,
         rounding=s,
     )
+    return problem, errors
 
 
 def taken_between_samples(plant: LinearPlant, grid: GridRows, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

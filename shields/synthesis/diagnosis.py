@@ -15,11 +15,7 @@ from shields.synthesis.tolerance import Tolerated
 def infeasibility(plant: LinearPlant, tolerated: Tolerated | None, *, polytope: bool, reason: str = "") -> Infeasible:
     """Returns the exception that names the binding condition and the fraction of the radii that is feasible.
 
-    Args:
-        plant: The plant.
-        tolerated: What the best gain bears; None if no gain stabilizes.
-        polytope: Whether a polytope alone would do, too.
-        reason: Why the polytope of a gain that bears the radii was given up.
+    `tolerated` is what the best gain bears, `reason` why the polytope of one that bears the radii was given up.
     """
     if tolerated is None:
         unmoved = unseen_state(plant.A.T, plant.B.T, 1.0 / plant.half_widths, plant.state_names)

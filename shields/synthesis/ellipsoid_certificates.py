@@ -35,20 +35,12 @@ _WIDEST_SPREAD = 1e6
 
 
 def largest_ellipsoid(
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    gains: Sequence[Tolerated],
-    search: Search,
+    plant: LinearPlant, contract: ChannelContract | None, gains: Sequence[Tolerated], search: Search
 ) -> Certificate | None:
     """Returns the largest set that alternation finds, verified; None where no set is found for no known reason.
 
-    Where the set leaves the box between samples, one is sought in a box that is smaller by that.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract, if there is one.
-        gains: Gains, one of which the search begins at.
-        search: Is told the stages, and holds the best candidate.
+    It begins at one of the gains. Where the set leaves the box between samples, one is sought in a box that is smaller
+    by that.
 
     Raises:
         Infeasible: If the plant has no design problem, or there is no certificate for a known reason.

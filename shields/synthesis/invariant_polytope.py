@@ -51,9 +51,9 @@ class Feedback(NamedTuple):
 
     Attributes:
         K: The gain, shape (m, n).
-        errors: Shapes of the sets of the estimation error, (l, n, n).
+        errors: Shapes of the error sets, (l, n, n).
         D: Shape of the disturbance set, (n, n).
-        rest: x_c and u_c, shapes (n,) and (m,).
+        rest: x_c and u_c.
     """
 
     K: np.ndarray
@@ -86,13 +86,8 @@ def invariant_polytope(
 ) -> Polytope:
     """Returns the largest polytope that a fallback keeps invariant, not yet verified.
 
-    A state along which it would have no end gets the limit within which its gain was sought.
-
-    Args:
-        feedback: The fallback.
-        plant: Its plant.
-        margin: One of `MARGINS`, from which also follows how much a row must cut.
-        progress: Called with a line of text now and then.
+    A state along which it would have no end gets the limit within which its gain was sought. From the margin, one of
+    `MARGINS`, follows how much a row must cut.
 
     Raises:
         Infeasible: If there is none within `MOST_ROWS` rows, `MOST_FOLLOWED` of them followed; the message says why.
@@ -178,15 +173,11 @@ def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
 
     Past inputs are the operating one. None where a state has no limits of its own.
     """
-    points, past = points_of_box(plant, _POINTS_LOG2), plant.past
-    if points is not None:
-        points[:, plant.n - past :] = 0.0
-        return float((polytope.gauge(points) <= 1.0).mean())
     low, high = plant.own_limits  # of the box that these make, further limits leave a part
     if not np.isfinite(plant.own_limits).all():
         return None
     points = low + (high - low) * qmc.Sobol(plant.n, scramble=False).random_base2(_POINTS_LOG2)
-    points[:, plant.n - past :] = 0.0
+    points[:, plant.n - plant.past :] = 0.0
     points = points[(plant.constraint_values(points.T) <= 0.0).all(axis=0)]
     return float((polytope.gauge(points) <= 1.0).mean()) if len(points) >= _LEAST_POINTS else None
 

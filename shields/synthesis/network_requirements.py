@@ -74,11 +74,7 @@ class Requirements:
 
 
 def share_of(certificate: Certificate) -> tuple[str, float]:
-    """Returns what fills how much of the safe box: ("ellipsoid", share), of limits with two ends ("polytope", share).
-
-    Where the box has more rows than states, the share of its largest ellipsoid; ("certificate", 1.0)
-    where nothing is known, as of a box that is open.
-    """
+    """Returns what fills how much of the safe box: "ellipsoid", "polytope", or ("certificate", 1.0) if not known."""
     known, polytope = certificate.provenance, certificate.polytope
     if polytope is not None and not certificate.keeps_ellipsoid and not polytope.is_symmetric:
         share = known.get("polytope_share_of_box")

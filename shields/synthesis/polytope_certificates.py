@@ -57,13 +57,8 @@ _NOT_CERTIFIED = (ArithmeticError, ValueError)
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
     """Returns a verified certificate with the largest polytope that its gain keeps in the box.
 
-    One that keeps a polytope alone is returned as it is. Without a polytope if none is found; its provenance, and so
-    the printed certificate, says why.
-
-    Args:
-        certificate: A verified one.
-        plant: Its plant.
-        progress: Called with a line of text now and then.
+    One that keeps a polytope alone is returned as it is. If none is found, the provenance, and so the printed
+    certificate, says why.
     """
     if not certificate.keeps_ellipsoid:
         return certificate
@@ -72,12 +67,12 @@ def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progre
             feedback_of(certificate), plant, lambda polytope: replace(certificate, polytope=polytope), progress
         )
     except _NOT_CERTIFIED as failure:
-        reason = _reason_of(failure)
+        reason = reason_of(failure)
     return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
 
 
-def _reason_of(failure: Exception) -> str:
-    """Returns why there is no polytope; what a library says of numbers stands in parentheses."""
+def reason_of(failure: Exception) -> str:
+    """Returns why there is no certificate; what a library says of numbers stands in parentheses."""
     if isinstance(failure, Infeasible):
         return str(failure)
     return f"its numbers are out of reach of float64 ({failure}): {MORE_DIGITS}"
@@ -93,14 +88,7 @@ def certified_polytope(
     """Returns a verified certificate with the largest polytope that a given gain keeps in the box.
 
     The polytope alone is claimed to be invariant; L is that of the largest ellipsoid inside it, and inside generous
-    limits where states have none.
-
-    Args:
-        plant: The plant with its bounds.
-        K: Gain, shape (m, n) [input per state].
-        contract: Channel contract; None for none.
-        rest: The point around which it is sought.
-        progress: Called with a line of text now and then.
+    limits where states have none. The gain K is of shape (m, n) [input per state].
 
     Raises:
         ArithmeticError, ValueError: If there is none; the message says why.
@@ -151,20 +139,11 @@ def _with_polytope_of(
 
 
 def around_resting_point(
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    gains: Sequence[Tolerated],
-    progress: Progress,
+    plant: LinearPlant, contract: ChannelContract | None, gains: Sequence[Tolerated], progress: Progress
 ) -> Certificate:
     """Returns a verified certificate of a polytope alone, around a resting point.
 
-    One polytope is sought for each of the `_MOST_SOUGHT` first gains, and for the most tolerant one.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract; None for none.
-        gains: Gains that are tried if they bear the radii.
-        progress: Called with a line of text now and then.
+    One polytope is sought for each of the `_MOST_SOUGHT` first gains that bear the radii, and for the most tolerant.
 
     Raises:
         Infeasible: If there is none: why the polytope of the first gain was given up.
@@ -175,7 +154,7 @@ def around_resting_point(
         try:
             return certified_polytope(plant, each.K, contract, each.rest, progress)
         except _NOT_CERTIFIED as failure:
-            reasons.append(_reason_of(failure))
+            reasons.append(reason_of(failure))
     raise infeasibility(plant, best, polytope=True, reason=reasons[0] if reasons else "")
 
 

@@ -100,10 +100,7 @@ def farthest_equilibrium(
 ) -> Farthest:
     """Returns the equilibrium whose nearest limit is farthest away, by a linear program.
 
-    Args:
-        plant: The plant.
-        needs: What distances from the limits are in units of, shape (r,), > 0; half the range by default.
-        limits: The r limits; those of `limit_rows` by default.
+    Distances from the limits, by default those of `limit_rows`, are in units of `needs`, by default of half the range.
 
     Raises:
         Infeasible: If no equilibrium is strictly within the limits.

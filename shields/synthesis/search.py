@@ -17,11 +17,7 @@ Progress = Callable[[str], object]
 
 
 class Search:
-    """Takes lines of progress, and raises `TimeoutError` at one of them once the time limit is over.
-
-    Args:
-        progress: Called with every line.
-        time_limit: Of the processor's time of this thread [s]; None for none.
+    """Takes lines of progress, and raises `TimeoutError` once the limit of the processor's time [s] is over.
 
     Attributes:
         candidate: Makes the best certificate so far, not yet verified; None while there is none.
@@ -42,11 +38,7 @@ class Search:
             raise TimeoutError
 
     def best_in_time(self, plant: LinearPlant) -> Certificate:
-        """Returns the best certificate so far, verified, where the time is over.
-
-        Raises:
-            Infeasible: If there is none.
-        """
+        """Returns the best certificate so far, verified, where the time is over; raises Infeasible if there is none."""
         over = f"the time_limit of {self._limit:g} s was over"
         best = None if self.candidate is None else self.candidate()
         if best is None or not verify(best, plant).valid:

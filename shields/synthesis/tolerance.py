@@ -87,10 +87,7 @@ class Tolerance:
     ever are a set around the resting point (Kolmanovsky and Gilbert 1998, docs/bibliography.md), else none is. The
     resting point is the operating point where limits are symmetric, else the one that suits each gain.
 
-    Args:
-        plant: The plant.
-        errors: Shapes of the error sets, (l, n, n).
-        D: Shape of the disturbance set, (n, n).
+    Errors are of the shapes (l, n, n), disturbances of the shape D, (n, n).
     """
 
     def __init__(self, plant: LinearPlant, errors: np.ndarray, D: np.ndarray) -> None:
@@ -248,7 +245,7 @@ def invariant_ellipsoid(problem: DesignProblem, K: np.ndarray) -> InvariantEllip
 
     For given multipliers (I) has a smallest solution, a Lyapunov series, which grows with the squares of the radii.
     """
-    _, K = problem.to_scaled(np.eye(problem.n), K)
+    K = (K @ problem.transform) / problem.u_max[:, None]
     BK, Sigma = problem.B @ K, problem.covering_error_shape
     closed_loop, from_errors = problem.A + BK, BK @ Sigma @ BK.T
     at_once = np.sqrt(np.maximum(((K @ Sigma) * K).sum(axis=1), 0.0))
@@ -276,11 +273,7 @@ def invariant_ellipsoid(problem: DesignProblem, K: np.ndarray) -> InvariantEllip
 
 
 def tolerated_gains(plant: LinearPlant, contract: ChannelContract | None) -> list[Tolerated]:
-    """Returns gains with what they bear: the most tolerant one, and regulators.
-
-    Raises:
-        Infeasible: If the plant has no error set, or no resting point.
-    """
+    """Returns the most tolerant gain and regulators; raises Infeasible without an error set or a resting point."""
     rest = farthest_equilibrium(plant).rest if needs_resting_point(plant) else at_operating_point(plant)
     _, errors = design_problem(plant, contract, limits_around(plant, rest))
     tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest))
@@ -296,11 +289,7 @@ def most_tolerant(gains: Sequence[Tolerated]) -> Tolerated | None:
 
 
 def most_tolerated(plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool) -> Tolerated | None:
-    """Returns the gain that bears the most of the radii with a polytope, or else an ellipsoid; None if none stabilizes.
-
-    Raises:
-        Infeasible: If the plant has no error set, or no resting point.
-    """
+    """Returns the gain that bears the most with a polytope, or else an ellipsoid; None if none stabilizes."""
     gains = tolerated_gains(plant, contract)
     if not polytope:
         problem, _ = design_problem(plant, contract)

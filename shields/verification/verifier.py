@@ -93,15 +93,10 @@ def _require_conditions(certificate: Certificate, plant: LinearPlant) -> None:
     for condition in verify(certificate, plant).conditions:
         if not condition.holds:
             if condition.name.startswith("plant"):
-                other = "made for another plant (fingerprints differ)"
-                if certificate.between_samples != plant.between_samples:
-                    made, asked = (_when(points) for points in (certificate.between_samples, plant.between_samples))
-                    other = f"made for another plant, or for a box that counts {made}: here it counts {asked}"
-                raise CertificateError(f"the certificate was {other}: synthesize one for this plant")
+                raise CertificateError(
+                    "the certificate was made for another plant, or for other times at which its box counts "
+                    "(fingerprints differ): synthesize one for this plant"
+                )
             raise CertificateError(
                 f"the certificate does not verify: {condition.name} does not hold (margin {condition.margin:.3g})"
             )
-
-
-def _when(points: int | None) -> str:
-    return "at the sampling instants" if points is None else f"at all times (between_samples={points})"

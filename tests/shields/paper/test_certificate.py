@@ -9,7 +9,7 @@ from ncs_gym import truck_trailer
 from shields import Infeasible, verify
 from shields.paper.bounds import PaperModel
 from shields.paper.feasibility import FeasibilityScan, largest_scale
-from tests.product import altered, library_plant, linear_plant, paper_synthesis, safety_filter, safety_shield
+from tests.product import altered, library_plant, paper_synthesis, safety_filter, safety_shield
 from tests.verdicts import broken, verified
 
 SMALL = library_plant(truck_trailer, gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
@@ -37,17 +37,6 @@ def test_no_shield_takes_a_certificate_of_the_paper(paper):
 
 
 @pytest.mark.slow
-def test_printed_parameters_are_infeasible_and_the_reason_has_figures():
-    with pytest.raises(Infeasible, match=r"\(C2\) binds") as caught:
-        paper_synthesis(truck_trailer(), dkappa=0.05, drho=0.1)  # proven over the whole domain
-    error = caught.value
-    assert error.binding == "C2"
-    assert error.shortfall == pytest.approx(1.0 - 0.034, abs=5e-4)
-    copy = pickle.loads(pickle.dumps(error))
-    assert (copy.binding, copy.shortfall) == (error.binding, error.shortfall)
-
-
-@pytest.mark.slow
 def test_reported_scale_is_feasible_and_a_little_more_is_not():
     plant = truck_trailer()
     scan = FeasibilityScan(plant)
@@ -62,13 +51,6 @@ def test_reported_scale_is_feasible_and_a_little_more_is_not():
     assert verified(paper_synthesis(scaled(0.97), dkappa=0.005, drho=0.01), scaled(0.97)).valid
     with pytest.raises(Infeasible):
         paper_synthesis(scaled(1.05), dkappa=0.05, drho=0.05)  # proven over the whole domain, whatever the grid
-
-
-@pytest.mark.slow
-def test_too_coarse_a_grid_says_so():
-    with pytest.raises(Infeasible, match="use smaller steps") as caught:
-        paper_synthesis(SMALL, dkappa=0.4, drho=1.0)
-    assert caught.value.binding == "grid"
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e4])
@@ -87,20 +69,6 @@ def test_units_of_the_state_change_nothing(unit, paper):
     assert verified(certificate, scaled).valid
     assert (certificate.kappa, certificate.rho) == (paper.kappa, paper.rho)
     np.testing.assert_allclose(certificate.L / unit**2, paper.L, rtol=1e-4)
-
-
-def one_state(A, B, u_max, gamma, Q, P0):
-    return linear_plant(
-        A=[[A]], B=[[B]], box=[[1.0]], u_max=u_max, dt=0.1, gamma=gamma, process_noise_cov=[[Q]], initial_cov=[[P0]]
-    )
-
-
-@pytest.mark.slow
-def test_an_input_limit_that_binds_is_named():
-    with pytest.raises(Infeasible, match="input limit") as caught:
-        paper_synthesis(one_state(1.5, 1.0, 0.4, 9.985e-4, 9.985e-4, 9.985e-4), dkappa=0.05, drho=0.1)
-    assert caught.value.binding == "C5"
-    assert 0.0 < caught.value.shortfall < 1.0
 
 
 def test_no_uncertainty_at_all_is_no_division_by_zero():
@@ -131,3 +99,10 @@ CHANGES = [
 @pytest.mark.parametrize(("condition", "change"), CHANGES)
 def test_changed_part_is_noticed_by_the_right_condition(paper, condition, change):
     assert any(each.startswith(condition) for each in broken(change(paper), SMALL))
+
+
+def test_grid_without_a_solution_says_so_also_in_a_copy():
+    with pytest.raises(Infeasible, match="take smaller steps") as caught:
+        paper_synthesis(SMALL, dkappa=0.4, drho=1.0)
+    copy = pickle.loads(pickle.dumps(caught.value))
+    assert (str(copy), copy.binding, copy.shortfall) == (str(caught.value), "OP", 1.0)
