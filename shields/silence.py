@@ -18,8 +18,9 @@ from ncs_gym.validation import as_count, counted
 from shields.certificate import Certificate
 from shields.certificate_text import labeled
 from shields.polytope import Polytope
-from shields.runtime.rows_within_step import rows_within_step
+from shields.synthesis.design_problem import Rest
 from shields.synthesis.faces import Extremes, Faces
+from shields.synthesis.resting_point import around, limit_rows
 from shields.verification import ACTION_ROUNDING, require_valid
 from shields.verification.polytope_conditions import faces_of
 
@@ -114,7 +115,7 @@ def silence_of(certificate: Certificate, plant: LinearPlant, input_delay: int = 
     rarest = contract.max_age - input_delay + 1  # steps from one sample to the next, if they arrive at once
     outages = [many * max(contract.max_age, 1) for many in OUTAGES]
     ways = [WayBack(steps, *(way_back(recursion, steps, gap) for gap in (1, rarest))) for steps in outages]
-    at_half, at_rest = fallbacks.kept_from(0.5), fallbacks.kept_from(0.0)
+    at_half, at_rest = (fallbacks.kept(0, MOST_STEPS, share) for share in (0.5, 0.0))
     return Silence(contract.max_age, plant.dt, fallbacks.kept_anywhere(), at_half, at_rest, tuple(ways))
 
 
@@ -130,20 +131,13 @@ class _Fallbacks:
     """
 
     def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
-        within, rest = rows_within_step(plant), certificate.fallback
-        (k, n), m = within.at_samples.shape, plant.m
-        at_samples = np.hstack([within.at_samples, np.zeros((k, m))])
-        inputs = np.hstack([np.zeros((m, n)), np.eye(m)])
-        rows = np.concatenate([at_samples, np.hstack([within.state, within.input]), inputs])
-        low = np.concatenate([within.low_at_samples, within.low, plant.input_ends[0]])
-        high = np.concatenate([within.high_at_samples, within.high, plant.input_ends[1]])
-        resting = rows @ np.concatenate([rest.resting_state, rest.resting_input])
-        disturbed = np.concatenate([np.zeros(k), within.disturbed, np.zeros(m)])
+        rest, n, k = certificate.fallback, plant.n, len(plant.box)
+        limits = around(limit_rows(plant, plant.disturbance.shape_matrix), Rest(rest.resting_state, rest.resting_input))
         # Where the box counts at samples alone, it is known to hold S.
         self._rows_on_states, self._first = k, 0 if plant.grid_rows is not None else k
-        self._low, self._high = low - resting, high - resting
-        self._own = disturbed + MARGIN * np.minimum(np.abs(self._low), np.abs(self._high))
-        self._on_state, self._on_input = rows[:, :n], rows[:, n:]
+        self._low, self._high = limits.low, limits.high
+        self._own = limits.disturbed + MARGIN * np.minimum(np.abs(self._low), np.abs(self._high))
+        self._on_state, self._on_input = limits.rows[:, :n], limits.rows[:, n:]
         self._on_estimate = self._on_state + self._on_input @ rest.gain
         self._powers, self._loops = _powers(plant.A), _powers(plant.A + plant.B @ rest.gain)
         self._moved = plant.A @ rest.resting_state + plant.B @ rest.resting_input - rest.resting_state
@@ -156,18 +150,14 @@ class _Fallbacks:
         """Returns after how many steps without a sample, from the oldest age that is allowed, the box may be left."""
         last, age = MOST_STEPS, 1  # the step from the oldest age itself is certified
         while age < last:
-            last = min(last, age + self._kept(age, last - age))
+            last = min(last, age + self.kept(age, last - age))
             age += 1
         return last
 
-    def kept_from(self, share: float) -> int:
-        """Returns the same from an estimate in a share of S, with the fallback input at every step."""
-        return self._kept(0, MOST_STEPS, share)
-
-    def _kept(self, age: int, most: int, share: float | None = None) -> int:
+    def kept(self, age: int, most: int, share: float | None = None) -> int:
         """Returns for how many steps the limits are kept, `age` steps after the oldest.
 
-        The state is in S then or, if a share is given, its estimate in that share of S.
+        The state is in S or, if a share is given, its estimate in that share of S.
         """
         if not self._keeps(age, 0, share)[self._first :].all():
             return 0

@@ -67,7 +67,6 @@ def synthesize(
     search = Search(progress, time_limit)
     try:
         found = first_certificate(plant, contract, search, polytope=polytope)
-        search.candidate = lambda: found
         return with_polytope(found, plant, search) if polytope else found
     except TimeoutError:
         return search.best_in_time(plant)

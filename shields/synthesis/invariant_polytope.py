@@ -18,9 +18,9 @@ from ncs_gym import LinearPlant, exact
 from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.polytope import MOST_ROWS, Polytope
-from shields.synthesis.design_problem import Rest, taken_between_samples
+from shields.synthesis.design_problem import Rest
 from shields.synthesis.faces import OPEN, Extremes, Faces, multipliers_of
-from shields.synthesis.resting_point import units_of_states
+from shields.synthesis.resting_point import around, limit_rows, units_of_states
 from shields.verification import ACTION_ROUNDING
 
 # The search follows at most so many rows from one step to the one before, nearly five times what it takes for any
@@ -232,24 +232,14 @@ def limits_within_step(feedback: Feedback, plant: LinearPlant) -> Faces:
     First the box less eta at the times of the plant's grid, ordered by time, then by row (docs/shield_proof.md,
     "Between the samples"); then limits of states and inputs together (the same, "States and inputs together").
     """
-    (K, errors, D, rest), n = feedback, plant.n
-    state, pushed = plant.mixed_rows[:, :n], plant.mixed_rows[:, n:]
-    (low, high), taken = plant.mixed_ends, float(ACTION_ROUNDING) * (np.abs(pushed) @ plant.input_half)
-    if plant.grid_rows is not None:
-        on_grid, pushed_on_grid, _ = plant.grid_rows
-        of_grid, disturbed = taken_between_samples(plant, plant.grid_rows, D)
-        points = len(on_grid)
-        state = np.concatenate([on_grid.reshape(-1, n), state])
-        pushed = np.concatenate([pushed_on_grid.reshape(-1, plant.m), pushed])
-        taken = np.concatenate([(of_grid + disturbed).ravel(), taken])
-        low, high = (
-            np.concatenate([np.tile(of_box, points), mixed])
-            for of_box, mixed in zip(plant.box_ends, (low, high), strict=True)
-        )
-    answer = pushed @ K
+    (K, errors, D, rest), mixed = feedback, len(plant.mixed_rows)
+    limits = around(limit_rows(plant, D), rest)
+    order = np.roll(np.arange(len(plant.box) + plant.m, len(limits.rows)), -mixed)
+    state, pushed = np.split(limits.rows[order], [plant.n], axis=1)
+    answer, taken = pushed @ K, limits.disturbed[order]
+    taken[len(order) - mixed :] += float(ACTION_ROUNDING) * (np.abs(plant.mixed_rows[:, plant.n :]) @ plant.input_half)
     least = taken + np.sqrt(np.maximum(np.einsum("ri,lij,rj->lr", answer, errors, answer), 0.0).max(axis=0))
-    at_rest = state @ rest.state + pushed @ rest.input
-    return Faces(state + answer, low - at_rest + least, high - at_rest - least)
+    return Faces(state + answer, limits.low[order] + least, limits.high[order] - least)
 
 
 class _ClosedLoop:

@@ -13,6 +13,7 @@ from benchmarks.published import channel_of, contract_of_plant, plant_of, publis
 from ncs_gym import ChannelContract, contract_of
 from ncs_gym.plants.resting_point import MovedOperatingPointWarning
 from shields import CertificateError, Infeasible
+from shields.synthesis.resting_point import farthest_equilibrium, improved
 from shields.synthesis.tolerance import most_tolerated
 from tests.certificates import certificate_of
 from tests.product import altered, linear_plant, synthesize
@@ -256,3 +257,9 @@ def test_plant_that_bears_little_more_than_its_radii_has_a_polytope(name):
     plant, contract = plant_of(name), contract_of_plant(name)
     assert most_tolerated(plant, contract, polytope=True).margin < 1.02
     assert verified(synthesize(plant, contract=contract), plant).valid
+
+
+def test_better_resting_point_is_an_equilibrium_nearer_to_the_best_one():
+    rest = improved(ANGLE, farthest_equilibrium(ANGLE).rest, lambda rest: -abs(rest.state[0] - 0.3))
+    assert rest.state[0] == pytest.approx(0.3, abs=0.02)
+    np.testing.assert_allclose(ANGLE.A @ rest.state + ANGLE.B @ rest.input, rest.state, atol=1e-9)

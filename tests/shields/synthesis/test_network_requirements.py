@@ -62,15 +62,15 @@ def test_less_than_what_was_refused_is_not_tried_and_more_than_what_is_certified
 
     def sought(plant, contract, search):
         tried.append((contract.max_age, contract.quantization_step))
-        if contract.max_age > 2 - contract.quantization_step:
+        if contract.max_age > 2 - min(contract.quantization_step, 1.0):
             raise Infeasible("none", "I", 1.0)
         return large if tried[-1] == (1, 1.0) else small
 
     monkeypatch.setattr(network_requirements, "first_certificate", sought)
     found = requirements(plant, ages=range(5), resolutions=[0.0, 1.0, 2.0])
     assert tried == [(0, 0.0), (1, 0.0), (2, 0.0), (3, 0.0), (0, 1.0), (1, 1.0), (2, 1.0), (0, 2.0), (1, 2.0)]
-    assert shares(found).tolist() == [[0.5, 0.5, 0.2], [0.5, 0.5, 0.0], [0.2, 0.0, 0.0], [0.0] * 3, [0.0] * 3]
-    assert [found.largest_age(each) for each in found.resolutions] == [2, 1, 0]
+    assert shares(found).tolist() == [[0.5, 0.5, 0.2], [0.5, 0.5, 0.2], [0.2, 0.0, 0.0], [0.0] * 3, [0.0] * 3]
+    assert [found.largest_age(each) for each in found.resolutions] == [2, 1, 1]
 
 
 @pytest.mark.slow
