@@ -117,10 +117,6 @@ class Fallback(NamedTuple):
         """u_c - K x_c, shape (m,), which K x_hat is added to."""
         return self.resting_input - self.gain @ self.resting_state
 
-    def with_gain(self, gain: np.ndarray) -> Fallback:
-        """Returns the input of another gain around the same point."""
-        return self._replace(gain=gain)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate(ReadOnlyArrays):

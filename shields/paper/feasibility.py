@@ -44,11 +44,7 @@ class FeasibilityScan:
         self._points = _scanned(self._problem)
 
     def best(self, plant: LinearPlant, model: PaperModel | None = None) -> Feasibility:
-        """Returns the point of largest ratio for the bounds of a plant, or for other constants of OP.
-
-        Raises:
-            LookupError: If no gain contracts any ellipsoid at any point: (C1) alone has no solution.
-        """
+        """Returns the point of largest ratio for the bounds of a plant, or for other constants of OP."""
         return self._ranked(model or PaperModel(plant))[0]
 
     def full_ratio(self, plant: LinearPlant, model: PaperModel | None = None) -> float:
@@ -63,8 +59,6 @@ class FeasibilityScan:
 
     def _ranked(self, model: PaperModel) -> list[Feasibility]:
         """Returns all points of the scan in order of falling ratio."""
-        if not self._points:
-            raise LookupError("(C1) has no solution at any (kappa, rho)")
         points = []
         for kappa, rho, eigenvalue in self._points:
             alpha = model.at(kappa, rho).alpha

@@ -73,16 +73,6 @@ class DesignProblem:
     rounding: float
 
     @property
-    def n(self) -> int:
-        """Number of states."""
-        return self.A.shape[0]
-
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return self.B.shape[1]
-
-    @property
     def maximal_error_shapes(self) -> np.ndarray:
         """The error sets that lie in no other one, shape (l, n, n), thickened where they are nearly flat.
 
@@ -94,7 +84,7 @@ class DesignProblem:
             if any(is_inside(Sigma, other) for other in others):
                 kept = others
         longest = np.linalg.eigvalsh(np.stack(kept))[:, -1]
-        return np.stack(kept) + _SMALLEST_AXIS_RATIO**2 * longest[:, None, None] * np.eye(self.n)
+        return np.stack(kept) + _SMALLEST_AXIS_RATIO**2 * longest[:, None, None] * np.eye(len(self.A))
 
     @cached_property
     def covering_error_shape(self) -> np.ndarray:

@@ -159,10 +159,7 @@ def around_resting_point(
 
 
 def _by_share(
-    gains: Sequence[Tolerated],
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    progress: Progress,
+    gains: Sequence[Tolerated], plant: LinearPlant, contract: ChannelContract | None, progress: Progress
 ) -> list[Tolerated]:
     """Returns gains that differ in a certificate's digits, those that keep the most of the box first.
 

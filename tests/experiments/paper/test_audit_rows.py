@@ -111,20 +111,6 @@ def test_margin_at_one_is_right_without_disturbance():
     assert claim.verdict == Verdict.UNDECIDED
 
 
-def test_only_if_example_by_sampling():
-    rng = np.random.default_rng(0)
-    M, closed = np.diag([1.0, 100.0]), np.diag([0.9, 0.0])
-    angles, kappa = rng.uniform(0.0, 2.0 * np.pi, (2, 50_000)), float(ONLY_IF.least_kappa)
-    states = np.stack([np.cos(angles[0]), np.sin(angles[0]) / 10.0])
-    push = 0.04 * np.stack([np.cos(angles[1]), np.sin(angles[1])])
-    following = closed @ states + push
-    assert (following * (M @ following)).sum(axis=0).max() <= 1.0
-    images = closed @ states
-    assert (images * (M @ images)).sum(axis=0).max() == pytest.approx(kappa, abs=1e-4)
-    inner = kappa**0.5 * states + push
-    assert (inner * (M @ inner)).sum(axis=0).max() > 1.0
-
-
 @pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("change", "is_invariant", "breaks_condition"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from ncs_gym import Channel, Ellipsoid, LinearPlant, contract_of
+from ncs_gym import Channel, Ellipsoid, contract_of
 from shields import Infeasible, verify
 from tests.certificates import certificate_of
 from tests.product import (
@@ -127,21 +127,6 @@ def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it(name):
     for proposed in plant.input_ends[::-1]:
         decision = copy.deepcopy(loop).decide(proposed)
         assert decision.input == pytest.approx(0.3 * np.sign(proposed), abs=1e-3)
-
-
-def test_file_and_fingerprint_hold_the_limits(tmp_path):
-    for name, plant in MIXED.items():
-        plant.save(tmp_path / "plant.json")
-        again = LinearPlant.load(tmp_path / "plant.json")
-        assert again.fingerprint == plant.fingerprint, name
-        np.testing.assert_array_equal(again.mixed_rows, plant.mixed_rows)
-        np.testing.assert_array_equal(again.mixed_ends, plant.mixed_ends)
-        assert altered(plant, mixed_ends=1.01 * plant.mixed_ends).fingerprint != plant.fingerprint
-    without = altered(PLANTS["coupled"], mixed_rows=None, mixed_ends=None)
-    assert not len(without.mixed_rows)
-    open_end = altered(without, mixed_limits=[([0.0, 0.0], [-0.5, 1.0], -np.inf, 0.2)])
-    open_end.save(tmp_path / "plant.json")
-    assert LinearPlant.load(tmp_path / "plant.json").mixed_ends[0].tolist() == [-np.inf]
 
 
 def test_plant_with_such_limits_has_none_that_are_only_symmetric():

@@ -84,27 +84,3 @@ def test_verdict_share_and_tolerated_scale_are_the_same_in_other_units(name, see
     assert verdict == own_verdict
     assert (verdict == "certified") == (name != "refused")
     np.testing.assert_allclose(numbers, own_numbers, rtol=0.01)
-
-
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
-@pytest.mark.parametrize("seed", range(20))
-def test_middle_of_a_disturbance_rests_at_the_same_point_in_other_units(seed):
-    rng = np.random.default_rng(seed)
-    state, applied = 10.0 ** rng.integers(-9, 10, 2), 10.0 ** rng.integers(-9, 10, 1)
-    low, high = np.array([0.0, -0.002]), np.array([0.004, 0.008])
-
-    def plant(state: np.ndarray, applied: np.ndarray) -> LinearPlant:
-        return linear_plant(
-            A=np.array([[0.9, 0.1], [0.02, 0.95]]) * state[:, None] / state,
-            B=np.array([[0.01], [0.1]]) * state[:, None] / applied,
-            dt=0.1,
-            state_limits=(-state, 2.0 * state),
-            input_limits=(-applied, applied),
-            disturbance_bound=(np.diag(state), low, high),
-            sensor_bound=0.0,
-            initial_bound=0.0,
-        )
-
-    own, other = plant(np.ones(2), np.ones(1)), plant(state, applied)
-    np.testing.assert_allclose(other.operating_state, own.operating_state * state, rtol=1e-7)
-    np.testing.assert_allclose(other.operating_input, own.operating_input * applied, rtol=1e-7)
