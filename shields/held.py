@@ -124,7 +124,6 @@ def _range_text(certificate: Certificate, plant: LinearPlant, state: int, input_
 
 
 def _row_of(output: Any, plant: LinearPlant) -> np.ndarray:
-    """Returns the row of an output, shape (n,)."""
     if isinstance(output, str):
         if output not in plant.state_names:
             raise ValueError(f"output must be one of the states {list(plant.state_names)}, got {shown(output)}")

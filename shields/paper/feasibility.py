@@ -58,7 +58,6 @@ class FeasibilityScan:
         return best
 
     def _ranked(self, model: PaperModel) -> list[Feasibility]:
-        """Returns all points of the scan in order of falling ratio."""
         points = []
         for kappa, rho, eigenvalue in self._points:
             alpha = model.at(kappa, rho).alpha

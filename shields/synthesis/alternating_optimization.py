@@ -116,5 +116,4 @@ def with_best_gain(problem: DesignProblem, design: CandidateDesign) -> Candidate
 
 
 def _larger(best: CandidateDesign, other: CandidateDesign | None) -> CandidateDesign:
-    """Returns the design with the larger set."""
     return other if other is not None and other.log_det > best.log_det else best

@@ -111,7 +111,6 @@ def _over_between_samples(certificate: Certificate, plant: LinearPlant) -> np.nd
 
 
 def _leaves_between_samples(shortfall: float) -> Infeasible:
-    """Returns the exception for sets that hold at the sampling instants alone."""
     return Infeasible(
         "(B) the state leaves the box between two samples: a shorter dt, more grid points (between_samples=) or less "
         "disturbance would help, and between_samples=1 asks for the sampling instants alone",
