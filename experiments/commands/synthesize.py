@@ -11,8 +11,6 @@ from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.settings import require_one_plant
 from ncs_gym import ChannelContract, LinearPlant
-from shields.certificate_text import size_of
-from shields.errors import SynthesisInterrupted
 from shields.packaged_certificates import synthesis_status
 
 
@@ -61,23 +59,14 @@ def synthesize(settings: SynthesizeSettings) -> None:
     if settings.between_samples is not None:
         plant = replace(plant, limits=replace(plant.limits, between_samples=settings.between_samples))
     contract = changed_contract(own, settings.max_age, settings.quantization_step)
-    try:
-        with synthesis_status() as show:
-            certificate = shields.synthesize(
-                plant,
-                contract=contract,
-                safe_set=settings.safe_set,
-                time_limit=settings.time_limit,
-                progress=show,
-            )
-    except SynthesisInterrupted as interrupt:
-        if interrupt.certificate is None:
-            raise
-        interrupt.certificate.save(settings.out)
-        size = size_of(interrupt.certificate)
-        raise SynthesisInterrupted(
-            f"interrupted: the best certificate so far, which verifies ({size}), was saved to {settings.out}"
-        ) from interrupt
+    with synthesis_status() as show:
+        certificate = shields.synthesize(
+            plant,
+            contract=contract,
+            safe_set=settings.safe_set,
+            time_limit=settings.time_limit,
+            progress=show,
+        )
     certificate.save(settings.out)
     print(certificate, shields.verify(certificate, plant), sep="\n")
     # Under another contract than the environment's no downlink is known.

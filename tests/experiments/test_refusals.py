@@ -18,7 +18,6 @@ from experiments.runs.arms import Arm
 from experiments.runs.loops import changed_channel, scenario_named, worse_channel
 from experiments.settings import BackendSettings
 from ncs_gym import Channel, ChannelContract
-from tests.certificates import feasible_age_not_sought
 from tests.command import assert_one_sentence, ncs
 
 NAN, INF = float("nan"), float("inf")
@@ -152,8 +151,7 @@ def test_calls_are_refused(call, words):
 
 @pytest.mark.parametrize(("line", "words"), USAGE)
 def test_usage_errors_are_the_parsers(line, words):
-    with feasible_age_not_sought():
-        run = ncs(*line.split(), COLUMNS="200")
+    run = ncs(*line.split(), COLUMNS="200")
     assert run.returncode == 2
     assert "Traceback" not in run.stderr
     assert words in " ".join(run.stderr.replace("│", " ").split())
