@@ -22,6 +22,10 @@ INFLATION = 1.0 + 1e-9
 # Axes of an error set are lengthened to at least this fraction of its longest one in the semidefinite programs; exact
 # verification uses the error set itself.
 _SMALLEST_AXIS_RATIO = 0.01
+# A box that is longer in one direction than in another by more, each state in units of its own limit, is refused.
+_FLATTEST = 1e7
+# Of the longest direction those states are named whose part in it is at least this much of the largest one.
+_SHARE_OF_DIRECTION = 0.1
 
 
 class Rest(NamedTuple):
@@ -127,9 +131,20 @@ def design_problem(
     The set is sought within `limits`, by default the plant's own.
 
     Raises:
-        Infeasible: If the plant has no error set, or its safe box is far too wide for times between samples.
+        Infeasible: If the plant has no error set, or its safe box is flat, or far too wide for times between samples.
     """
     limits = SymmetricLimits(plant.box_rows, plant.u_max) if limits is None else limits
+    _, sizes, directions = np.linalg.svd(limits.box_rows * plant.half_widths)
+    flatness = float(sizes[0] / sizes[-1])
+    if flatness > _FLATTEST:
+        large = np.flatnonzero(np.abs(directions[-1]) > _SHARE_OF_DIRECTION * np.abs(directions[-1]).max())
+        names = " or ".join(plant.state_names[j] for j in large.tolist())
+        raise Infeasible(
+            f"the safe box is flat, {flatness:.0e} times longer in one direction than in another that is no axis: add "
+            f"a limit of {names}, along which it is long, or leave out those that limit the short one",
+            "S",
+            flatness,
+        )
     try:
         _ = plant.grid_rows
     except OverflowError as error:

@@ -71,11 +71,15 @@ REFUSED = [
         )
     ),
     (lambda: paper_synthesis(library_plant(truck_trailer, box=[[0.5, 0.0]])), Infeasible, "unbounded"),
-    (lambda: synthesized([[1.0, 1.0], [1.0, 1.0 + 1e-8]]), Infeasible, "out of reach of float64 .* give states units"),
     (
         lambda: synthesized([1.0, 1e5], gamma=4.0),
         Infeasible,
         r"take no state to a hundredth of \|x2\| <= 1e\+05 in 2 steps: leave out limits that stand for none",
+    ),
+    (
+        lambda: synthesized([[1.0, 1.0], [1.0, 1.0 + 1e-8]]),
+        Infeasible,
+        r"the safe box is flat, \de\+\d+ times longer in one direction .*: add a limit of x1 or x2, along which it is",
     ),
     (
         lambda: synthesized([1.0, 1e7]),
