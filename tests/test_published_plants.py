@@ -68,7 +68,7 @@ def test_no_controller_bears_what_noise_hides_and_a_certificate_bears_less():
     assert isinstance(most, Fraction)
     assert float(most) == pytest.approx(2.0, rel=1e-9)
     assert synthesize(bounded_by(1.8), contract=ChannelContract(1))
-    with feasible_age_not_sought(), pytest.raises(Infeasible):
+    with pytest.raises(Infeasible):
         synthesize(bounded_by(2.01), contract=ChannelContract(1))
 
 
