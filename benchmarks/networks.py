@@ -346,7 +346,7 @@ def measured(env_id: str, network: str, name: str, count: int, hours: float) -> 
         ended += np.count_nonzero(terminated)
         ever += np.count_nonzero(info.get("shield_guaranteed", False))
     number = steps * count
-    return Measured(ended, number * dt / 3600.0, ever / number)
+    return Measured(int(ended), number * dt / 3600.0, ever / number)
 
 
 def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> CaptionedFigure:
