@@ -5,12 +5,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import platform
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +16,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.agent_file import AgentError, pretrained_folder, read_files
+from agents.agent_file import AgentError, installed_versions, pretrained_folder, read_files
 from agents.algorithms import build_model
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig, ShieldSettings
@@ -32,6 +29,7 @@ from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
 
 _FORMAT = "ncs-gym agent 3"
+_DEPENDENCIES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +104,10 @@ class Agent:
         return self.kwargs | ({} if self.channel is None else {"channel": self.channel})
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries).
-
-        Args:
-            observations: As the environment returns them; a single one, shape (entries,), gives one action, shape (m,).
+        """Returns deterministic actions, shape (N, m) or (m,), for raw observations, shape (N, entries) or (entries,).
 
         Raises:
-            ValueError: If observations have another number of entries than those the agent was trained with, or are
-                not finite.
+            ValueError: If observations have another number of entries than in training, or are not finite.
         """
         observations = np.asarray(observations)
         shape, entries = observations.shape, self.normalization.mean.size
@@ -131,13 +125,7 @@ class Agent:
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, None]:
-        """Returns actions as `act` does, and no state: what code that has a model of stable-baselines3 calls.
-
-        Args:
-            observation: As for `act`.
-            state: Not used, no policy here is recurrent.
-            episode_start: Not used, either.
-            deterministic: Must be True.
+        """Returns actions as `act` does, and no state: what code for models of stable-baselines3 calls.
 
         Raises:
             ValueError: As `act` does, or if actions are to be drawn.
@@ -158,7 +146,7 @@ class Agent:
         """Returns the contents of `model.zip`, in stable-baselines3's format, and of `agent.json`, with the rest.
 
         Raises:
-            ValueError: If the environment was made with something that a file does not keep.
+            ValueError: See `require_kept`.
         """
         require_kept(self.kwargs, self.env)
         buffer = io.BytesIO()
@@ -168,7 +156,7 @@ class Agent:
             "env": self.env,
             "algorithm": self.algorithm,
             "seed": self.seed,
-            "versions": _versions(),
+            "versions": installed_versions(_DEPENDENCIES),
             "hyperparams": self.hyperparams,
             "channel": to_json(self.channel),
             "shield": self.shield_mode and {"mode": self.shield_mode, "horizon": self.horizon},
@@ -190,10 +178,10 @@ class Agent:
 
         Args:
             folder: The folder, which is made if it does not exist; files of these names are replaced.
-            shield: The shield that the agent is meant to act behind, whose certificate is saved; None for none.
+            shield: The shield that the agent is meant to act behind, whose certificate is saved.
 
         Raises:
-            ValueError: If the certificate is for another plant than that of the agent's environment, or see `files`.
+            ValueError: If the certificate is for another plant than that of the agent's environment; see `files`.
             OSError: If a file cannot be written.
         """
         folder = Path(folder)
@@ -239,12 +227,9 @@ class Agent:
 
 
 def pretrained(env_id: str) -> Agent:
-    """Returns the small agent of an environment that comes with the package.
+    """Returns the small agent that comes with the package for an id.
 
     It was trained behind the shield of the environment's certificate (`shields.certificate_for`).
-
-    Args:
-        env_id: Id of an environment of this package.
 
     Raises:
         AgentError: If the package has none for it, or the environment has changed since.
@@ -273,7 +258,7 @@ def _plant_of(env_id: str, kwargs: Mapping[str, Any]) -> LinearPlant | None:
 
 
 def _is_for_plant_of(env_id: str, kwargs: Mapping[str, Any], fingerprint: str | None) -> bool:
-    """Returns whether what was stored with a fingerprint belongs to an environment's plant, or lack of one."""
+    """Returns whether a fingerprint is that of an environment's plant, None of one without a plant."""
     plant = _plant_of(env_id, kwargs)
     return fingerprint is None if plant is None else fingerprint is not None and plant.fingerprint == fingerprint
 
@@ -322,15 +307,6 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         horizon=shield["horizon"],
         kwargs=kwargs,
     )
-
-
-def _versions() -> dict[str, str]:
-    """Returns the versions of the installed packages that training depends on."""
-    found = {"python": platform.python_version()}
-    for name in ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy"):
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
 
 
 # What an agent.json has: what else it says might be a part of the policy.

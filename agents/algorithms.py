@@ -30,11 +30,7 @@ _LINEAR = "lin_"
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """Returns the class of an algorithm.
-
-    Raises:
-        ModuleNotFoundError: If its package is not installed.
-    """
+    """Returns the class of an algorithm; raises ModuleNotFoundError if its package is not installed."""
     package = ALGORITHMS[name]
     if importlib.util.find_spec(package) is None:
         extra = "contrib" if package == "sb3_contrib" else "train"
@@ -44,7 +40,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 
 
 def normalized_env(name: str, env: VecEnv, hyperparams: Mapping[str, Any]) -> VecNormalize:
-    """Returns an environment as an agent learns in it; agents keep the statistics of the observations.
+    """Returns an environment that normalizes what an agent learns from.
 
     Raises:
         ValueError: If the hyperparameter `normalize` is neither true nor arguments of `VecNormalize`, or leaves
@@ -69,30 +65,22 @@ def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: in
         steps: Number of steps it will be trained for, over which linear rates fall.
 
     Raises:
-        ValueError: If there is no such hyperparameter, or stable-baselines3 does not take its value; the message names
-            those that the algorithm has.
+        ValueError: If there is no such hyperparameter, or stable-baselines3 does not take its value.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     cls = algorithm_class(name)
     try:
         return cls(env=env, seed=seed, device="cpu", **_arguments(name, cls, env, hyperparams, steps))
     except Exception as error:  # the library checks by many kinds of errors
-        known = [*_not_the_librarys(name), *(each for each in _parameters(cls) if each not in _NO_HYPERPARAMS)]
-        raise ValueError(f"{name}: {reason_of(error)}; its hyperparameters are {', '.join(known)}") from error
-
-
-def _not_the_librarys(name: str) -> tuple[str, ...]:
-    """Returns the hyperparameters of an algorithm that its constructor does not take."""
-    return "n_envs", "n_timesteps", "normalize", *(() if name in ON_POLICY else ("noise_std", "stored_action"))
+        raise ValueError(f"{name}: {reason_of(error)}") from error
 
 
 def _arguments(
     name: str, cls: type[BaseAlgorithm], env: VecEnv, hyperparams: Mapping[str, Any], steps: int
 ) -> dict[str, Any]:
     """Returns the arguments of the constructor; raises ValueError if a hyperparameter is unknown."""
-    own: dict[str, Any] = {
-        key: copy.deepcopy(value) for key, value in hyperparams.items() if key not in _not_the_librarys(name)
-    }
+    ours = {"n_envs", "normalize"} | (set() if name in ON_POLICY else {"noise_std", "stored_action"})
+    own: dict[str, Any] = {key: copy.deepcopy(value) for key, value in hyperparams.items() if key not in ours}
     for key, value in own.items():
         if isinstance(value, str) and value.startswith(_LINEAR):
             own[key] = _falling(float(value.removeprefix(_LINEAR)), name, env, hyperparams, steps)
@@ -114,11 +102,7 @@ def _arguments(
 
 
 def policy_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the hyperparameter `policy_kwargs` as policies take it: with the class of its activation function.
-
-    Raises:
-        ValueError: If torch has no activation function of that name.
-    """
+    """Returns `policy_kwargs` with the class of its activation function; raises ValueError if torch has none such."""
     found, name = dict(given), given.get("activation_fn")
     if name is not None:
         own = str(name).removeprefix("nn.")
@@ -129,7 +113,7 @@ def policy_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _falling(rate: float, name: str, env: VecEnv, hyperparams: Mapping[str, Any], steps: int) -> LinearSchedule:
-    """Returns a rate that falls linearly; the last update still has the rate at the start of its rollout.
+    """Returns a rate that falls linearly, to that at the start of the last rollout.
 
     The library evaluates the schedule at the end of each rollout, where that of the last one would be zero.
     """
@@ -138,14 +122,10 @@ def _falling(rate: float, name: str, env: VecEnv, hyperparams: Mapping[str, Any]
     return LinearSchedule(rate * (1.0 + fraction), rate * fraction, 1.0)
 
 
-def _parameters(cls: type) -> Mapping[str, inspect.Parameter]:
-    return inspect.signature(cls).parameters
-
-
 def _require_known(cls: type, arguments: Mapping[str, Any], prefix: str = "") -> None:
     """Raises ValueError if a class of the library has no such argument, or it is given here."""
     for name in arguments:
-        if name not in _parameters(cls) or name in _NO_HYPERPARAMS:
+        if name not in inspect.signature(cls).parameters or name in _NO_HYPERPARAMS:
             raise ValueError(f"{prefix}unknown hyperparameter {shown(name)}")
 
 
@@ -159,8 +139,8 @@ class AppliedActionBuffer(ReplayBuffer):
     """Stores, in the place of the agent's action, the one that the shield let through.
 
     Hand it to SAC, TD3 and their kind as `replay_buffer_class`, and its infos to
-    `SB3VecEnv(info_keywords=AppliedActionBuffer.info_keywords)`. `train` does so with the hyperparameter
-    `stored_action="applied"`. It is for returns of one step (`n_steps=1`), and for actions of one control step.
+    `SB3VecEnv(info_keywords=AppliedActionBuffer.info_keywords)`; with `stored_action="applied"` `train` does both. It
+    is for returns of one step (`n_steps=1`), and for actions of one control step.
 
     Attributes:
         info_keywords: The infos that it reads, and those that `SB3VecEnv` has at every step anyway.

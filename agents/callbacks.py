@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,6 @@ class SafetyCallback(BaseCallback):
 
     Args:
         on_progress: Called with the number of steps taken since its last call.
-        history: Totals of the training that this one goes on from; empty for one that begins.
         priced: The penalty of PPO-Lagrangian, whose value totals hold; None without one.
 
     Attributes:
@@ -44,23 +43,17 @@ class SafetyCallback(BaseCallback):
         interventions: Steps so far in which the shield intervened.
     """
 
-    def __init__(
-        self,
-        on_progress: Callable[[int], None] | None = None,
-        history: Sequence[TrainingPoint] = (),
-        priced: CostPenalty | None = None,
-    ) -> None:
+    def __init__(self, on_progress: Callable[[int], None] | None = None, priced: CostPenalty | None = None) -> None:
         super().__init__()
-        self.history = list(history)
         self._on_progress, self._priced = on_progress, priced
-        self._first = TrainingPoint(0, float("nan"), 0, 0)
-        self.violation_steps, self.interventions = self._last.violation_steps, self._last.interventions
+        self.history: list[TrainingPoint] = []
+        self.violation_steps = self.interventions = self._noted = 0
 
     def _on_training_start(self) -> None:
         self._interval = self.locals["total_timesteps"] // _MAX_POINTS
-        if self.num_timesteps < self._last.steps:
+        if self.num_timesteps < self._noted:
             self.history, self.violation_steps, self.interventions = [], 0, 0
-        self._first = TrainingPoint(self.num_timesteps, float("nan"), 0, 0)
+        self._noted = self.num_timesteps
 
     def _on_step(self) -> bool:
         batch = _counted(self)
@@ -77,33 +70,20 @@ class SafetyCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        if self.num_timesteps - self._last.steps >= self._interval:
-            self.add_point()
+        if self.num_timesteps - self._noted >= self._interval:
+            self._note()
 
     def _on_training_end(self) -> None:
-        if self._last.steps < self.num_timesteps:
-            self.add_point()
+        if self._noted < self.num_timesteps:
+            self._note()
 
-    @property
-    def so_far(self) -> list[TrainingPoint]:
-        """The history, to the present step."""
-        return self.history + [self._present] * (self._last.steps < self.num_timesteps)
-
-    @property
-    def _last(self) -> TrainingPoint:
-        return self.history[-1] if self.history else self._first
-
-    @property
-    def _present(self) -> TrainingPoint:
+    def _note(self) -> None:
         returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
         mean = float(np.mean(returns)) if returns else float("nan")
         multiplier = float("nan") if self._priced is None else self._priced.penalty
-        return TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions, multiplier)
-
-    def add_point(self) -> None:
-        """Adds a point to the curve, of what happened since the last one."""
-        taken = self.num_timesteps - self._last.steps
-        self.history.append(self._present)
+        point = TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions, multiplier)
+        self.history.append(point)
+        taken, self._noted = self.num_timesteps - self._noted, self.num_timesteps
         if self._on_progress is not None:
             self._on_progress(taken)
 

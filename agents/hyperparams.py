@@ -5,7 +5,6 @@ Most are keyword arguments of the algorithm's constructor in stable-baselines3, 
 and these names are no arguments of the constructor:
 
 - `n_envs`: number of environments stepped side by side;
-- `n_timesteps`: training steps, where the caller asks for no number of them;
 - `normalize`: true, or arguments of `VecNormalize` such as `{"norm_reward": false}`;
 - `noise_std`: exploration noise of off-policy algorithms, in units of the limits;
 - `policy_kwargs`: may have `activation_fn`, an activation function of `torch.nn` by its name, such as "nn.ReLU";
@@ -87,11 +86,11 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
 
     Args:
         algorithm: A name in `ALGORITHMS`.
-        given: Hyperparameters by name; None for none.
+        given: Hyperparameters by name.
 
     Raises:
         ValueError: If the algorithm is unknown, what is given is no dictionary of JSON values, or `gamma` or a count
-            (`n_envs`, `n_steps`, `n_epochs`, `batch_size`, `buffer_size`) is out of range.
+            such as `n_envs` is out of range.
     """
     if not (isinstance(algorithm, str) and algorithm in ALGORITHMS):
         raise ValueError(f"unknown algorithm {shown(algorithm)}; known are {', '.join(ALGORITHMS)}")
@@ -114,12 +113,7 @@ def rollout_steps(algorithm: str, hyperparams: Mapping[str, Any]) -> int:
 
 
 def tuned_hyperparams(env_id: str, algorithm: str = "PPO") -> dict[str, Any] | None:
-    """Returns the hyperparameters tuned for an environment; None where there are none, as for plants of one's own.
-
-    Args:
-        env_id: Id by which the environment is registered.
-        algorithm: Name of the learning algorithm; none but PPO is tuned.
-    """
+    """Returns the hyperparameters tuned for a registered id; None where there are none. None but PPO is tuned."""
     entry = _tuned().get(env_id) if algorithm == "PPO" else None
     return None if entry is None else {name: value for name, value in entry.items() if name != "n_timesteps"}
 

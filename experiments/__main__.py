@@ -33,14 +33,13 @@ COMMANDS = {
     "sweep": "Compares arms over a grid of channels: how safety, return and interventions depend on the channel.",
     "render": "Draws an episode of a policy, as an animation or its last frame.",
     "synthesize": "Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.",
-    "verify": "Verifies a certificate in exact rational arithmetic against the plant it was made for.",
-    "export-c": "Writes a safety filter in C99 for a board, with test vectors that check it.",
+    "verify": "Verifies a certificate in exact arithmetic, says what it keeps, and writes its safety filter in C99 for "
+    "a board.",
     "bounds": "Says what bounds of a plant's disturbances a record of it proves, and writes a plant with them.",
     "channel": "Reads recorded packets, and says how often each channel contract would have been broken.",
     "requirements": "Finds how old and how coarse the samples of a plant may be, so that it is certifiable.",
     "attack": "Attacks shielded loops with worst-case disturbances and agents, and counts states outside.",
-    "audit": "Checks the claims of the paper (Liu et al.) one by one, from its own printed numbers.",
-    "reproduce": "Simulates Section 5 of Liu et al. with three designs: printed, certified, and OP's.",
+    "paper": "Checks the claims of the paper (Liu et al.) from its own printed numbers, or simulates its Section 5.",
 }
 # The extra that a command needs, and the packages of an extra.
 _EXTRAS = dict.fromkeys(("compare", "train", "evaluate", "sweep"), "train") | {"render": "render"}
@@ -80,7 +79,7 @@ def main() -> None:
         else:
             with nullcontext() if os.environ.get("NCS_DEBUG") else warnings_as_sentences():
                 settings = parse(sys.argv[1:])
-                getattr(_module(command), command.replace("-", "_"))(settings)
+                getattr(_module(command), command)(settings)
     except KeyboardInterrupt as interrupt:
         sys.exit(_complain(str(interrupt) or "interrupted", _INTERRUPTED))
     except BrokenPipeError:
@@ -111,13 +110,13 @@ def parse(arguments: list[str]) -> object:
 
 def settings_of(command: str) -> type:
     """Returns the class of a command's settings."""
-    return getattr(_module(command), f"{command.title().replace('-', '')}Settings")
+    return getattr(_module(command), f"{command.title()}Settings")
 
 
 def _module(command: str) -> object:
     from importlib import import_module
 
-    return import_module(f"experiments.commands.{command.replace('-', '_')}")
+    return import_module(f"experiments.commands.{command}")
 
 
 def _require_extra(extra: str) -> None:
@@ -132,7 +131,7 @@ def _require_extra(extra: str) -> None:
 
 
 def _overview() -> str:
-    """Returns the commands, each with the first sentence about it, in lines of the terminal's width."""
+    """Returns the commands with what they do, in lines of the terminal's width."""
     from experiments.terminal import wrapped
 
     indent = max(map(len, COMMANDS)) + 4
@@ -141,7 +140,7 @@ def _overview() -> str:
 
 
 def _description(settings: type) -> str:
-    """Returns what a command does, of the docstring of its settings, in lines of the terminal's width."""
+    """Returns what the docstring of settings says of their command, in lines of the terminal's width."""
     from inspect import getdoc
 
     from experiments.terminal import wrapped
@@ -151,10 +150,7 @@ def _description(settings: type) -> str:
 
 
 def _sentence(error: Exception) -> str:
-    """Returns an error as one line; only unexpected errors show their type.
-
-    What it quotes of a file is shown, and means nothing to a terminal.
-    """
+    """Returns an error as one printable line; only unexpected errors show their type."""
     from ncs_gym.validation import printable
 
     ours = type(error).__module__.partition(".")[0] == "experiments"

@@ -52,7 +52,7 @@ print(envs.step(numpy.ones((3, 1), numpy.float32))[4]["episode_violations"].sum(
 
 def test_commands_about_certificates_work(binaries, tmp_path):
     file = tmp_path / "c.json"
-    for arguments in (["synthesize", "--out", file], ["verify", file], ["audit"]):
+    for arguments in (["synthesize", "--out", file], ["verify", file], ["paper"]):
         result = run(binaries / "ncs", *arguments, cwd=tmp_path)
         assert result.returncode == 0, result.stderr
 

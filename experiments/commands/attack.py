@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
-from experiments.settings import id_alone, require_horizon, require_limits, short_version
+from experiments.settings import id_alone, require_horizon, require_limits
 from experiments.terminal import progress_bar, say, text_table, wrapped
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, LinearPlant
 from ncs_gym.registration import EPISODE_STEPS, registered_ids
@@ -33,15 +33,13 @@ class AttackSettings:
     full size, and agents are random or hostile. Ends with exit code 1 if a guaranteed state is outside.
 
     Attributes:
-        env: Id of the only environment to attack; module:id first imports the module, which registers one of your own.
-            By default all registered ones.
+        env: Id of the only environment to attack, or module:id; by default all registered ones.
         steps: Simulated steps in all, at least 8 episodes of each environment and channel.
         mode: Mode of the shield; "monitor" only watches. In mode lookahead states may leave the safe set.
         safe_set: What the shields keep; by default the polytope, where there is one.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         out: File for the counts (JSON).
         seed: Seed of the attack, >= 0.
-        smoke: Attack one environment a little, to see that everything works.
     """
 
     env: str | None = None
@@ -51,7 +49,6 @@ class AttackSettings:
     horizon: int | None = None
     out: Path | None = None
     seed: int = 0
-    smoke: bool = False
 
     def __post_init__(self) -> None:
         require_limits(self, steps=1, seed=0)
@@ -74,7 +71,6 @@ _LEGEND = (
 
 def attack(settings: AttackSettings) -> None:
     """Runs `ncs attack`; ends with exit code 1 if a guaranteed state was outside, or a guarantee was lost."""
-    settings = short_version(settings, steps=1, env=settings.env or registered_ids()[0])
     require_place(settings.out)
     envs = {each: registered_env(each) for each in ([settings.env] if settings.env else registered_ids())}
     channels = {env_id: channels_of(env.channel, env.contract) for env_id, env in envs.items()}
@@ -111,7 +107,7 @@ def attack(settings: AttackSettings) -> None:
 
 
 def channels_of(own: Channel, contract: ChannelContract | None) -> dict[str, Channel]:
-    """Returns a channel, and those that use a contract up by delays and by losses; without one a blackout."""
+    """Returns a channel, and those that use its contract up by delays and by losses; without one a blackout."""
     if contract is None:
         return {"own": own, "blackout": Channel(loss=1.0)}
     age, step = contract.max_age, contract.quantization_step
@@ -154,10 +150,9 @@ def hostile_agents(
 
 
 def attacked(shield: VectorSafetyShield, rng: np.random.Generator) -> Iterator[Counter[str]]:
-    """Plays an episode in each environment behind a shield, from the boundary of the safe set.
+    """Plays an episode in each environment from the boundary of the safe set, and yields the counts of each step.
 
-    Yields what is counted at the start and in each step; "lost" is a guarantee that ended although the channels kept
-    their contracts.
+    "lost" is a guarantee that ended although the channels kept their contracts.
     """
     certificate, plant, count = shield.certificate, shield.filter.plant, shield.num_envs
     reach = _INWARD if shield.env.unwrapped.single.downlink is None else _BEHIND_DOWNLINK

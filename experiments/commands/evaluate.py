@@ -18,7 +18,7 @@ from experiments.runs.output_folder import require_place
 from experiments.runs.policies import agent_named, certificate_file
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import RunResult
-from experiments.settings import Assignments, id_alone, require_horizon, require_limits, short_version
+from experiments.settings import Assignments, id_alone, require_horizon, require_limits
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
@@ -39,10 +39,8 @@ class EvaluateSettings:
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
         certificate: Certificate file to use instead of that of the training, or of synthesizing one.
-        between_samples: Times per step at which the safe box counts, 1 for the sampling instants; by default the
-            plant's own.
+        between_samples: Times per step at which the safe box counts; by default the plant's own.
         channel: Changes of the channel that the agent was trained with, by the names that `ncs compare` lists.
-        smoke: Evaluate a few episodes only, to see that everything works.
         out: File for the summary (JSON).
     """
 
@@ -55,7 +53,6 @@ class EvaluateSettings:
     certificate: Path | None = None
     between_samples: int | None = None
     channel: Assignments = field(default_factory=dict)
-    smoke: bool = False
     out: Path | None = None
 
     def __post_init__(self) -> None:
@@ -64,13 +61,8 @@ class EvaluateSettings:
             require_horizon(self, self.shield)
 
 
-# Budget of `--smoke`.
-_SMOKE = {"episodes": 5}
-
-
 def evaluate(settings: EvaluateSettings) -> None:
     """Runs `ncs evaluate`."""
-    settings = short_version(settings, **_SMOKE)
     require_place(settings.out)
     env_id = None
     if settings.env is not None:

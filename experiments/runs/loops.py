@@ -8,13 +8,13 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 
 from agents.loop import LoopConfig
 from experiments.settings import id_alone
-from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv
+from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.contract import contract_of
 from ncs_gym.registration import needing_extras, registered_ids
@@ -29,8 +29,7 @@ _SHARE = 1e-3
 def registered_env(env_id: str) -> NCSEnv:
     """Returns a registered environment that has a plant of its own.
 
-    Args:
-        env_id: Id, or "module:id" as Gymnasium takes it, which imports the module: only for ids that the user gave.
+    The id may be "module:id", which imports the module: only for ids that the user gave.
 
     Raises:
         ValueError: If the id is not registered or has no plant of its own, or there is no such module.
@@ -73,12 +72,39 @@ def import_module(module: str) -> None:
         raise ValueError(f"there is no module {module!r}, neither installed nor in {folder}") from error
 
 
+class PlantInUse(NamedTuple):
+    """A plant, and what is known of the environment that it is in, if it is in one.
+
+    Attributes:
+        origin: Id of the environment, or the plant's file.
+        plant: The plant.
+        contract: Contract of the environment's certificates.
+        input_delay: Steps by which inputs are committed ahead.
+        asks: Whether samples are taken on request.
+    """
+
+    origin: str
+    plant: LinearPlant
+    contract: ChannelContract | None = None
+    input_delay: int = 0
+    asks: bool = False
+
+
+def plant_in_use(env_id: str, file: Path | None) -> PlantInUse:
+    """Returns the plant of a file, otherwise that of an environment; for errors see `registered_env`."""
+    if file is not None:
+        return PlantInUse(str(file), LinearPlant.load(file))
+    env = registered_env(env_id)
+    delay = env.downlink_protocol.input_delay
+    return PlantInUse(env_id, env.plant, env.certificate_contract, delay, env.channel.on_request)
+
+
 def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs: Any) -> LoopConfig:
     """Returns the bare control loop of a registered environment.
 
     Args:
-        env_id: Id, or "module:id" if the user gave it.
-        channel: Changes of the environment's own channel by name; see `changed_channel`.
+        env_id: As for `registered_env`.
+        channel: As for `with_channel`.
         **kwargs: Keyword arguments of the environment; None keeps its own.
 
     Raises:
@@ -89,17 +115,13 @@ def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs:
 
 
 def with_channel(loop: LoopConfig, changes: Mapping[str, Any]) -> LoopConfig:
-    """Returns a control loop with changes of its channel; for arguments and errors see `changed_channel`."""
+    """Returns a control loop with changes of its channel; see `changed_channel`."""
     changed = changed_channel(ncs_env(loop.single()).channel, changes)
     return loop if changed is None else loop.with_kwargs(channel=asdict(changed))
 
 
 def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
-    """Returns an environment's own channel with changes; None for no changes.
-
-    Args:
-        own: The environment's own channel.
-        changes: Fields of `Channel` by name; None keeps a value.
+    """Returns an environment's own channel with changes of its fields, of which None changes nothing; else None.
 
     Raises:
         ValueError: If a name is unknown or a value out of range.
@@ -115,7 +137,7 @@ def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
 
 
 def fewer_losses(channel: Channel) -> str:
-    """Returns that a channel loses fewer packets than its losses say, since it loses so many in a row; else nothing."""
+    """Returns that a channel with a limit of losses in a row loses fewer packets than its `loss` says; else nothing."""
     most, wanted = channel.max_consecutive_losses, replace(channel, max_consecutive_losses=None).mean_loss
     if most is None or channel.mean_loss >= wanted - _SHARE:
         return ""
@@ -130,11 +152,7 @@ AS_TRAINED = "as trained"
 
 
 def scenario_named(name: str) -> str:
-    """Returns a scenario's name as it is printed; hyphens stand for spaces.
-
-    Raises:
-        ValueError: If it is unknown.
-    """
+    """Returns a scenario's name as it is printed, with spaces for hyphens; raises ValueError if it is unknown."""
     for known in (AS_TRAINED, *_CHANGES):
         if known.replace("-", " ") == name.replace("-", " "):
             return known
@@ -142,16 +160,12 @@ def scenario_named(name: str) -> str:
 
 
 def other_scenarios(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the different scenarios that are named, without that of the training.
-
-    Raises:
-        ValueError: If one is unknown.
-    """
+    """Returns the different scenarios that are named, without that of the training; see `scenario_named`."""
     return tuple(dict.fromkeys(name for each in names if (name := scenario_named(each)) != AS_TRAINED))
 
 
 def under(scenario: str, loop: LoopConfig) -> LoopConfig:
-    """Returns a control loop under a scenario; everything else stays the same.
+    """Returns a control loop under a scenario.
 
     Raises:
         ValueError: If the scenario is unknown, or the channel cannot be worse within the contract.
@@ -160,14 +174,10 @@ def under(scenario: str, loop: LoopConfig) -> LoopConfig:
 
 
 def worse_channel(channel: Channel, contract: ChannelContract | None) -> Channel:
-    """Returns a channel on which half of the packets that arrived are lost too, and the others are later.
+    """Returns a channel that loses half of the packets that arrived, and delays the others more.
 
-    All are as late as the latest were, and, as far as a contract allows it, later by one transmission period. Without
-    a contract every delay is allowed; with one, losses are where the channel loses packets at all.
-
-    Args:
-        channel: The channel that agents were trained with.
-        contract: What the certificate assumes of the channel; None for nothing.
+    All are as late as the latest were, and, as far as the certificate's contract allows it, later by one transmission
+    period. Without a contract every delay is allowed; with one, a channel without losses stays without.
 
     Raises:
         ValueError: If there is no worse channel within the contract.
@@ -189,7 +199,6 @@ def worse_channel(channel: Channel, contract: ChannelContract | None) -> Channel
 
 
 def _more_loss(loss: float | GilbertElliott) -> float | GilbertElliott:
-    """Returns losses that let half as many packets through, in each state of a bursty channel."""
     if isinstance(loss, GilbertElliott):
         return replace(loss, loss_good=_more_loss(loss.loss_good), loss_bad=_more_loss(loss.loss_bad))
     return 0.5 * (1.0 + loss)
@@ -200,18 +209,14 @@ def _on_worse_channel(loop: LoopConfig) -> LoopConfig:
     return loop.with_kwargs(channel=asdict(worse_channel(env.channel, env.contract)))
 
 
-def bursts_at_their_longest(channel: Channel) -> Channel:
-    """Returns a channel that loses as many packets in a row as it may, each time; one without losses as it is."""
-    return channel if channel.most_consecutive_losses == 0 else replace(channel, loss=1.0)
-
-
 def _on_ideal_channel(loop: LoopConfig) -> LoopConfig:
     return loop.with_kwargs(channel=asdict(Channel()))
 
 
 def _attacked(loop: LoopConfig) -> LoopConfig:
     """Returns a loop with the disturbance that does the most harm, noise of full size, and bursts at their longest."""
-    worst = bursts_at_their_longest(ncs_env(loop.single()).channel)
+    own = ncs_env(loop.single()).channel
+    worst = own if own.most_consecutive_losses == 0 else replace(own, loss=1.0)
     return loop.with_kwargs(disturbance="adversarial", noise="extreme", channel=asdict(worst))
 
 
@@ -228,10 +233,7 @@ _CHANGES: dict[str, Callable[[LoopConfig], LoopConfig]] = {
 def certificate_of(loop: LoopConfig, file: Path | None = None, safe_set: str | None = None) -> Certificate:
     """Returns a certificate for the plant of a control loop, under the contract of its channels.
 
-    Args:
-        loop: The control loop.
-        file: File of the certificate, which is verified; None synthesizes one.
-        safe_set: Of one that is synthesized: "polytope", "ellipsoid" or None; see `shields.synthesize`.
+    It is read from a file and verified, or for None made with a `safe_set` (see `shields.certificate_for`).
 
     Raises:
         ValueError: If the environment cannot have its keyword arguments.

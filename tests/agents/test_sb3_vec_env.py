@@ -8,10 +8,8 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
-from stable_baselines3 import PPO
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import LoopConfig, SB3VecEnv, train
 from ncs_gym import Channel, VectorNetworked, VectorRequestActions
@@ -216,15 +214,6 @@ def test_attributes():
     env.close()
     with pytest.raises(ValueError, match="must be a gymnasium VectorEnv"):
         SB3VecEnv(gym.make("CartPole-v1"))
-
-
-def test_evaluate_policy_counts_episodes_by_its_infos():
-    env = VecMonitor(SB3VecEnv(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=20)))
-    model = PPO("MlpPolicy", VecNormalize(env), seed=0, device="cpu", n_steps=32).learn(96)
-    assert len(model.ep_info_buffer) > 0
-    returns, lengths = evaluate_policy(model, env, n_eval_episodes=7, return_episode_rewards=True)
-    assert lengths == [20] * 7
-    assert len(returns) == 7
 
 
 def test_actions_are_those_that_were_handed_over_whatever_is_written_into_them_later():

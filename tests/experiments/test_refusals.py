@@ -79,7 +79,7 @@ USAGE = [
     ("sweep --losses 0.1 0.1", "--losses must be different"),
     ("sweep --arms shielded shielded", "--arms must be different values"),
     ("sweep --channel loss=0.5", "--channel loss is a side of the grid"),
-    ("reproduce --starts 0", "--starts must be"),
+    ("paper --starts 0", "--starts must be"),
 ]
 
 ONE_SENTENCE = [
@@ -97,7 +97,7 @@ ONE_SENTENCE = [
     ("compare --channel loss=1.5", "loss"),
     ("compare --hyperparams gamma=2", "gamma must be in [0, 1], got 2"),
     ("compare --certificate nowhere.json", "cannot read certificate nowhere.json"),
-    ("train --hyperparams gama=0.9", "PPO: unknown hyperparameter 'gama'; its hyperparameters are"),
+    ("train --hyperparams gama=0.9", "PPO: unknown hyperparameter 'gama'"),
     ("evaluate pretrained", "give --env"),
     ("train --env ncs_gym/BatchReactor-v0 --channel quantization_step=0.1", "rounds to 0.1, the contract allows 0.001"),
     ("synthesize --out no/such/folder/c.json", "No such file or directory"),
@@ -129,9 +129,8 @@ UNWRITABLE = [
     ("verify c.json --out here", "Is a directory: here", "name the file"),
     ("verify c.json --out nowhere/v.json", "No such file or directory: nowhere;", "check the path"),
     ("evaluate agent --out nowhere/e.json", "No such file or directory: nowhere;", "check the path"),
-    ("audit --out nowhere/a.json", "No such file or directory: nowhere;", "check the path"),
     ("render --out nowhere/e.gif", "No such file or directory: nowhere;", "check the path"),
-    ("reproduce --out file", "File exists: file;", "choose another path"),
+    ("paper --out file", "File exists: file;", "choose another path"),
     ("compare --smoke --out file", "file"),
     ("attack --out nowhere/a.json", "No such file or directory: nowhere;", "check the path"),
 ]

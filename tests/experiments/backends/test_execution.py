@@ -47,11 +47,11 @@ def test_results_are_those_of_this_process_whatever_the_number_of_jobs(jobs, cer
 def test_finished_runs_are_kept_and_not_executed_again(tmp_path, capsys):
     runs = [Small(name, "work", tmp_path) for name in "abc"]
     with pytest.warns(UserWarning, match=r"[ab] warns"):
-        assert [result.text for result in results_of(runs[:2], tmp_path, TWO)] == ["a said so", "b said so"]
-    assert "waiting: 100%" in capsys.readouterr().err
+        assert [result.arm for result in results_of(runs[:2], tmp_path, TWO)] == ["a said so", "b said so"]
+    assert "evaluation: 100%" in capsys.readouterr().err
     (tmp_path / "a began").unlink()
     with pytest.warns(UserWarning, match="c warns"):
-        assert [result.text[0] for result in results_of(runs[::-1], tmp_path, TWO)] == ["c", "b", "a"]
+        assert [result.arm[0] for result in results_of(runs[::-1], tmp_path, TWO)] == ["c", "b", "a"]
     assert not (tmp_path / "a began").exists()
     assert "2 of 3 runs were finished before" in capsys.readouterr().err
 

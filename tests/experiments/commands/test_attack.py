@@ -53,12 +53,6 @@ def test_table_has_every_channel_and_their_sum(tmp_path):
         assert counts["outside S"] == counts["guaranteed outside S"] == counts["lost"] == 0
 
 
-def test_a_short_version_attacks_one_environment():
-    run = succeeded("attack", "--smoke")
-    assert list(rows_of(run)) == ["own", "blackout", "all"]
-    assert rows_of(run)["all"][:2] == ["3,200", "16"]
-
-
 def test_the_attack_does_harm_where_the_shield_only_watches():
     counts = counts_of(shield_of(CART, 16, "monitor"))
     assert counts["outside box"] > 100

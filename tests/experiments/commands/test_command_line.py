@@ -159,7 +159,7 @@ def digests(folder):
     return {path: path.read_bytes() for path in files}
 
 
-@pytest.mark.parametrize("command", [["compare", "--episodes", 3], ["train", "--steps", 64], ["reproduce"]])
+@pytest.mark.parametrize("command", [["compare", "--episodes", 3], ["train", "--steps", 64], ["paper"]])
 def test_finished_study_is_not_overwritten(command, smoke):
     out, before = smoke[0], digests(smoke[0])
     assert_one_sentence(ncs(*command, "--out", out), f"{out} holds results of ", "give another --out, or --force")

@@ -7,13 +7,13 @@ import pytest
 from agents import tuned_hyperparams
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
-from agents.results import Episode
 from experiments.analysis.episodes import arm_summary, episodes_table, paired_differences
 from experiments.commands.compare import CompareSettings, shortened
 from experiments.commands.train import TrainSettings, train
 from experiments.report.text_tables import summary_text
 from experiments.runs.arms import full_names, require_arms, run_of_arm
 from experiments.runs.training_run import RunResult
+from tests.experiments.results import episode
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
 
@@ -159,8 +159,7 @@ def test_one_agent_has_one_algorithm():
 
 def result(returns, violations, interventions=0, index=0):
     episodes = [
-        Episode(i, 10, r, v, 2 * v, interventions, True, 0.5)
-        for i, (r, v) in enumerate(zip(returns, violations, strict=True))
+        episode(i, r, v, 2 * v, interventions) for i, (r, v) in enumerate(zip(returns, violations, strict=True))
     ]
     return RunResult("arm", index, 100, 4, 20, [], episodes)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.commands.compare import CompareSettings
-from experiments.commands.reproduce import ReproduceSettings
+from experiments.commands.paper import PaperSettings
 from experiments.commands.sweep import SweepSettings
 from experiments.commands.train import TrainSettings
 from experiments.errors import OtherResultsError
@@ -35,7 +35,7 @@ def finished(command, settings, file="summary.json"):
         ("train", TrainSettings, {"arm": "unshielded"}, "arm"),
         ("train", TrainSettings, {"steps": 3}, "steps"),
         ("sweep", SweepSettings, {"episodes": 3}, "episodes"),
-        ("reproduce", ReproduceSettings, {"starts": 3}, "starts"),
+        ("paper", PaperSettings, {"starts": 3}, "starts"),
     ],
 )
 def test_folder_with_results_of_other_settings_is_refused(command, kind, change, words, file, tmp_path):

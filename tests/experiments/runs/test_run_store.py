@@ -4,9 +4,8 @@ from dataclasses import replace
 import pytest
 
 from agents.loop import LagrangianSettings
-from experiments.backends.execution import results_of
+from experiments.backends.execution import load, results_of, save
 from experiments.baselines import EstimateFilterSettings
-from experiments.runs.output_folder import load, save
 from experiments.runs.provenance import versions
 from experiments.settings import BackendSettings
 from tests.experiments.results import training_run

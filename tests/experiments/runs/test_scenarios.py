@@ -8,11 +8,11 @@ import pytest
 
 from agents.loop import LoopConfig
 from experiments.analysis.episodes import arm_summary
+from experiments.backends.execution import load, save
 from experiments.commands.compare import CompareSettings
 from experiments.report.text_tables import summary_text
 from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import other_scenarios, scenario_named, under, worse_channel
-from experiments.runs.output_folder import load, save
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott
 from ncs_gym.envs.env import ncs_env
 from tests.experiments.results import run
