@@ -22,11 +22,10 @@ _MAX_POINTS = 200
 class SafetyCallback(BaseCallback):
     """Counts violations of the true state and interventions in every training step, and logs their rates.
 
-    The counts come from the info of every step, whereas `Monitor` only sees the last step of each episode. The callback
-    works with any stable-baselines3 algorithm, on `SB3VecEnv` and on single environments. TensorBoard gets
-    `safety/violation_rate` and `safety/intervention_rate` (per step since the last log), `safety/mean_correction` (the
-    mean norm of applied minus proposed input since the last log, with a shield), `safety/guaranteed_rate` (steps after
-    which the state is proved safe, since the last log, with a shield) and `safety/violation_steps` (total).
+    It works with any stable-baselines3 algorithm, on `SB3VecEnv` and on single environments. TensorBoard gets
+    `safety/violation_steps` (total) and means over the steps since the last log: `safety/violation_rate`,
+    `safety/intervention_rate`, and with a shield `safety/mean_correction` (norm of applied minus proposed input) and
+    `safety/guaranteed_rate` (steps after which the state is proved safe).
 
     A training step is counted once. Behind action repeat, which takes several control steps in one, infos are those of
     the last: `episode_violations` and `episode_interventions` count all.
@@ -96,19 +95,17 @@ class DualAscentCallback(BaseCallback):
 
         multiplier <- max(0, multiplier + learning_rate (J - d)).
 
-    It is for algorithms that learn from fresh rollouts: a replay buffer keeps rewards at former prices. Rollouts that
-    are shorter than an episode are taken together until they are as long. J does not wait for episodes to end, which
-    those of many environments do in the same step, and an episode that a violation ends does not count as a cheap one.
+    Rollouts that are shorter than an episode are taken together until they are as long. J does not wait for episodes to
+    end, and an episode that a violation ends does not count as a cheap one.
 
     This is the constrained baseline of Ray et al. 2019 with a plain gradient step in place of Adam, and the PID
     controller of Stooke et al. 2020 with the integral term alone (docs/bibliography.md). The cost is part of
-    the reward, so one value function estimates both, where theirs have one each. With a limit of zero the multiplier
-    never falls. TensorBoard gets `safety/multiplier`.
+    the reward, so one value function estimates both, where theirs have one each. TensorBoard gets `safety/multiplier`.
 
     Args:
         settings: Limit and learning rate.
         priced: The environment's penalty, which is set.
-        episode_steps: Steps of an episode of full length, as `LoopConfig.episode_steps` says.
+        episode_steps: See `LoopConfig.episode_steps`.
     """
 
     def __init__(self, settings: LagrangianSettings, priced: CostPenalty, episode_steps: int) -> None:

@@ -35,10 +35,9 @@ def evaluate(
     """Returns what a policy does in a number of episodes, played side by side.
 
     Args:
-        loop: The control loop, whose penalties are left out. Every episode is played once, to its end, whatever
-            autoreset the loop has.
+        loop: The control loop, whose penalties are left out, and whose autoreset counts for nothing.
         policy: Maps observations and infos to actions.
-        episodes: Number of episodes, at least 1.
+        episodes: How many, at least 1.
         seed: Seed of all random numbers (see `Episode.index`).
         safe_set: M, shape (n, n), or a polytope, for `Episode.times_safe_set`.
         on_progress: Called with the number of steps taken since its last call.
@@ -56,7 +55,7 @@ def evaluate(
     for first in range(0, episodes, _MAX_PARALLEL_EPISODES):
         indices = range(first, min(first + _MAX_PARALLEL_EPISODES, episodes))
         finished += _played(alone, policy, indices, seed, safe_set, on_progress)
-    return Evaluation(loop, finished)
+    return Evaluation(finished)
 
 
 def _played(
@@ -67,7 +66,6 @@ def _played(
     safe_set: np.ndarray | Polytope | None,
     on_progress: Callable[[int], None] | None,
 ) -> list[Episode]:
-    """Returns episodes played side by side."""
     count, envs = len(indices), loop.vector(len(indices))
     inner: Any = envs.unwrapped
     if envs.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:

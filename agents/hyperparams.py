@@ -96,7 +96,14 @@ def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None)
         raise ValueError(f"unknown algorithm {shown(algorithm)}; known are {', '.join(ALGORITHMS)}")
     if not isinstance(given, Mapping | None):
         raise ValueError(f"hyperparameters must be a dictionary, got {type(given).__name__}")
-    hyperparams = with_changes(DEFAULTS[algorithm], _as_json(given or {}))
+    try:
+        copied = json.loads(json.dumps(dict(given or {}), allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(
+            f"hyperparameters must be JSON values, got {shown(given)} ({reason_of(error)}); what is none is written as "
+            "a text, as in 'nn.ReLU' or 'lin_0.003'"
+        ) from error
+    hyperparams = with_changes(DEFAULTS[algorithm], copied)
     for name in _COUNTS:
         if name in hyperparams and (type(value := hyperparams[name]) is not int or value < 1):
             raise ValueError(f"{name} must be a whole number >= 1, got {shown(value)}")
@@ -126,18 +133,3 @@ def tuned_steps(env_id: str, algorithm: str = "PPO") -> int | None:
 @cache
 def _tuned() -> dict[str, dict[str, Any]]:
     return json.loads(resources.files("agents").joinpath("tuned", "ppo.json").read_text("utf-8"))
-
-
-def _as_json(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a copy; raises ValueError for the first value that JSON has not."""
-    copied: dict[str, Any] = {}
-    for name, value in hyperparams.items():
-        try:
-            copied |= json.loads(json.dumps({name: value}, allow_nan=False))
-        except (TypeError, ValueError, RecursionError) as error:
-            given = f"{shown(name)}: {shown(value)}"
-            raise ValueError(
-                f"hyperparameters must be JSON values, got {given} ({reason_of(error)}); what is none is written as a "
-                "text, as in 'nn.ReLU' or 'lin_0.003'"
-            ) from error
-    return copied

@@ -31,8 +31,7 @@ class ShieldSettings:
         on_unproved: What the shield does where the state is not proved safe: "ignore", "warn" or "raise".
 
     Raises:
-        ValueError: If the mode is unknown, or what is to be done where nothing is proved, or the certificate is none
-            that a shield takes, or mode "lookahead" does not take the horizon, or the penalty is negative.
+        ValueError: If a value is none that a shield takes.
     """
 
     certificate: Certificate
@@ -131,7 +130,7 @@ class LoopConfig:
 
     @property
     def other_kwargs(self) -> dict[str, Any]:
-        """Keyword arguments besides the channel, JSON values where they can be: as files of agents keep them."""
+        """Keyword arguments besides the channel, as files of agents keep them."""
         kwargs = {name: value for name, value in self.kwargs.items() if name != "channel"}
         if "plant" in kwargs:
             kwargs["plant"] = read_plant(kwargs["plant"])
@@ -175,19 +174,14 @@ class LoopConfig:
 
 
 class CostPenalty(AroundEnvironments, VectorWrapper):
-    """Subtracts a penalty from the reward of every step after which the true state violates the safe box.
-
-    Args:
-        env: A vector environment with `cost` in its infos.
-        penalty: Subtracted per violating step; may be changed while an agent is trained.
-    """
+    """Subtracts a penalty, which may be changed, from the reward of every step that violates the safe box."""
 
     def __init__(self, env: VectorEnv, penalty: float) -> None:
         self.penalty = penalty
         super().__init__(env)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Steps the environments; the cost of an episode's last step is read from its final info."""
+        """Steps the environments; raises ValueError if their infos have no cost."""
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         if "cost" not in info:
             raise ValueError('a penalty of violations needs environments with "cost" in their infos, these have none')

@@ -7,7 +7,6 @@ from math import nan
 
 import numpy as np
 
-from agents.loop import LoopConfig
 from ncs_gym.validation import counted
 
 
@@ -65,14 +64,8 @@ class Episode:
 
 @dataclass(frozen=True, repr=False)
 class Evaluation:
-    """The finished episodes of an evaluation.
+    """The finished episodes of an evaluation, in order of their index."""
 
-    Attributes:
-        loop: The control loop that they were played in, but for its penalties.
-        episodes: All episodes, in order of their index.
-    """
-
-    loop: LoopConfig
     episodes: list[Episode]
 
     def __repr__(self) -> str:

@@ -29,15 +29,7 @@ KNOWN_STEPS = 100_000
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a training run returns.
-
-    Attributes:
-        agent: The trained policy.
-        history: Totals up to different steps of the training.
-        steps: Environment steps taken, in whole rollouts: at least as many as were asked for.
-        violation_steps: Training steps whose true state violated the safe box.
-        interventions: Training steps in which the shield intervened.
-    """
+    """A trained agent, totals up to different steps of its training, and those at the end (see `TrainingPoint`)."""
 
     agent: Agent
     history: list[TrainingPoint] = field(repr=False)
@@ -63,14 +55,14 @@ def train(
     torch has one thread once `agents.SB3VecEnv` is imported; `torch.set_num_threads` changes both that and results.
 
     Args:
-        loop: The control loop the agent is trained in.
+        loop: The control loop.
         steps: Environment steps to train for, rounded up to whole rollouts.
         seed: Seed of environments, network weights and sampling. Loops with the same seed use common random numbers
             (starts, disturbances, noise, packet losses) as long as their episodes last equally long.
         algorithm: A name in `agents.hyperparams.ALGORITHMS`.
         hyperparams: Keyword arguments of the algorithm in stable-baselines3, and `n_envs` and `normalize`, JSON values;
             what is not given has the values of `agents.hyperparams.DEFAULTS`.
-        log_folder: Folder for TensorBoard's events; None for none.
+        log_folder: Folder for TensorBoard's events.
         on_progress: Called with the number of steps taken since its last call; an exception ends the training.
         callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
         start: An agent to go on from, of the same environment, algorithm and networks: its weights, the state of its
@@ -118,7 +110,7 @@ def untrained(
 
 
 def require_trainable(loop: LoopConfig, steps: int, algorithm: str, hyperparams: Mapping[str, Any]) -> None:
-    """Raises what `train` would with these arguments, before anything is computed."""
+    """Raises what `train` would with these arguments."""
     _trainable(loop, steps, 0, algorithm, complete_hyperparams(algorithm, hyperparams))[0].close()
 
 

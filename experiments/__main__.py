@@ -5,7 +5,6 @@ Whatever takes time to import is imported inside `main`, where an interrupt ends
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 
@@ -16,15 +15,6 @@ a command, `ncs --version` prints the version. The commands:
 """
 _ERROR = 2
 _INTERRUPTED = 130
-# What to do about an error of the operating system.
-_REMEDIES = {
-    errno.EEXIST: "a file stands where a folder is needed, choose another path",
-    errno.ENOTDIR: "a file stands where a folder is needed, choose another path",
-    errno.EISDIR: "a folder stands where a file is needed, name the file",
-    errno.ENOENT: "check the path",
-    errno.EACCES: "choose a path where you may read and write",
-    errno.ENOSPC: "make room and start the command again, which keeps what is finished",
-}
 # What each command does: the first sentence of its settings.
 COMMANDS = {
     "compare": "Trains agents with and without the shield and compares violations, return and interventions.",
@@ -156,7 +146,6 @@ def _sentence(error: Exception) -> str:
     ours = type(error).__module__.partition(".")[0] == "experiments"
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
-        text += f"; {_REMEDIES[error.errno]}" if error.errno in _REMEDIES else ""
     elif ours or isinstance(error, (ValueError, OSError, ImportError)):
         text = str(error)
     else:

@@ -150,7 +150,7 @@ class LearningSettings(BackendSettings):
 
     Attributes:
         env: Id of an environment with a plant; module:id imports the module first.
-        seed: Seed of the experiment, >= 0.
+        seed: Seed of the experiment.
         steps: Training steps per run, in whole rollouts; by default those tuned for the environment, or 150,000, and
             of several algorithms the most.
         episodes: Evaluation episodes per run.
@@ -167,7 +167,7 @@ class LearningSettings(BackendSettings):
             max_consecutive_losses.
         hyperparams: Hyperparameters in the words of stable-baselines3, such as gamma=0.99 or
             'policy_kwargs={"net_arch": [64]}'; others are tuned for the environment, or the default.
-        lagrangian: How the arm "lagrangian" adapts its penalty per violating step; no option of the command line.
+        lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
         smoke: Run a short version to see that everything works, by default in a folder with -smoke in its name.
         force: Replace results of other settings in the output folder.
     """

@@ -99,8 +99,8 @@ class RegulatorProblem:
 def regulator_problem(env: NCSEnv, weights: RegulatorWeights) -> RegulatorProblem:
     """Returns what a regulator of an environment's task minimizes.
 
-    Its cost weighs the error in the task's width, states in units of the box and inputs in units of their limits. The
-    speed error of `SpeedTracking`, e+ = e - dt u, is a state of its own. For `Regulation` it is what the reward counts.
+    The error is in units of the task's width, states of the box and inputs of their limits. The speed error of
+    `SpeedTracking`, e+ = e - dt u, is a state of its own. For `Regulation` it is what the reward counts.
     """
     plant, task = env.plant, env.task
     if isinstance(task, SetpointTracking):
@@ -239,19 +239,16 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
 
 
 def equilibrium(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns state (n,) and input (m,) with x = A x + B u and c x = 1, the smallest in units of box and limits.
+    """Returns state (n,) and input (m,) with x = A x + B u and c x = 1 for an output c, the smallest ones.
 
-    Where there is none, the least-squares solution. The output is c, shape (n,).
+    Where there are none, the least-squares solution; both in units of box and limits.
     """
     both = _rests(plant, output, plant.A, plant.B)[:, -1]
     return both[: plant.n], both[plant.n :]
 
 
 def _rests(plant: LinearPlant, output: np.ndarray, A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Returns R, shape (entries + m, n + 1): R (d, r) is a z above a u with z = A z + B u + (d, 0) and c z = r.
-
-    As `equilibrium`; A and B are those of a `RegulatorProblem`.
-    """
+    """Returns R, shape (entries + m, n + 1): R (d, r) is z above u with z = A z + B u + (d, 0) and c z = r."""
     n, others = plant.n, np.ones(len(A) - plant.n)
     half, scale = np.append(plant.half_widths, others), np.concatenate([plant.half_widths, others, plant.input_half])
     rest = np.hstack([np.eye(len(A)) - A, -B]) / half[:, None]
@@ -298,10 +295,7 @@ _PURSUED = Regulation, SpeedTracking, SetpointTracking
 
 
 def why_aimless(name: str, task: Task) -> str:
-    """Returns why a controller cannot pursue what a task asks for, an empty string if it can.
-
-    What another reward asks for nobody knows, nor what other observations are; a profile of targets may be your own.
-    """
+    """Returns why a controller cannot pursue what a task with its own reward asks for, an empty string if it can."""
     own = type(task).reward, type(task).observe
     if name not in REGULATORS or any(own == (each.reward, each.observe) for each in _PURSUED):
         return ""
@@ -314,12 +308,12 @@ def why_aimless(name: str, task: Task) -> str:
 def controller(
     name: str, env: NCSEnv, fallback: Fallback, seed: int, weights: RegulatorWeights = DEFAULT_WEIGHTS
 ) -> Policy:
-    """Returns a policy for vector environments of a kind.
+    """Returns a policy in `CONTROLLERS` or `REGULATORS` for vector environments.
 
     Args:
-        name: A name in `CONTROLLERS` or `REGULATORS`.
+        name: Its name.
         env: A single environment with the plant and the task.
-        fallback: A certificate's: u = u_c + K (x_hat - x_c), K x_hat around the operating point.
+        fallback: What "K x_hat" applies.
         seed: Seed of the random policy.
         weights: Weights of the regulators.
 

@@ -31,18 +31,13 @@ Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 class CertaintyEquivalentFilter:
-    """Decides as the shield does, with Sigma_k = 0 in the place of the true error ellipsoid.
-
-    This is what a safety filter does that is handed an estimate as if it were the state. Everything else is kept: the
-    safe set S, the disturbance bound E(D), the projection onto the inputs that pass, the margins against rounding, and
-    K x_hat where no input passes. With the error ellipsoid goes the proof: x = x_hat
-    is all it would hold for.
+    """Decides as the shield does, with Sigma_k = 0 in the place of the true error ellipsoid, and so without a proof.
 
     Args:
         certificate: Verified exactly here.
         plant: The plant it was made for.
-        margin: Fraction of the safe set that is kept free after the next step: the next state is taken to be off by as
-            much, margin^2 L in the place of A Sigma_k A', where states can be off at all: past inputs are known.
+        margin: Fraction of the safe set that is kept free after the next step: margin^2 L in the place of A Sigma_k A',
+            where states can be off at all (past inputs are known).
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -74,11 +69,11 @@ class PredictiveFilter:
     The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied,
     the true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's
     error sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan
-    already, nothing is solved. Where the program has no solution, the rest of the last plan is applied, as the authors
-    do, and the fallback when it is used up.
+    already, nothing is solved. Where the program has no solution, the rest of the last plan is applied, then the
+    fallback.
 
-    After Wabersich and Zeilinger 2018 and Wabersich and Zeilinger 2021, both of which tighten; the tube of an estimate
-    is that of Mayne et al. 2006 (docs/bibliography.md).
+    After Wabersich and Zeilinger 2018 and Wabersich and Zeilinger 2021; the tube of an estimate is that of
+    Mayne et al. 2006 (docs/bibliography.md).
 
     Args:
         certificate: Gives S and K; verified exactly here.
@@ -252,13 +247,8 @@ FILTERS: dict[str, Callable[..., Rule]] = {
 class EstimateFilter(VectorWrapper):
     """Applies what a filter makes of the proposed inputs, given the estimates; it proves nothing.
 
-    The infos gain `shield_intervened`, `input_proposed` and `shield_correction` as behind a `VectorSafetyShield`, but
-    no `shield_guaranteed`. A step that only resets an environment counts no intervention.
-
-    Args:
-        env: A vector environment with `estimate` in its infos.
-        rule: Decides the inputs.
-        penalty: Subtracted from the reward per intervention.
+    The infos gain `shield_intervened`, `input_proposed` and `shield_correction`, but no `shield_guaranteed`. A step
+    that only resets an environment counts no intervention. The penalty is subtracted from the reward per intervention.
 
     Raises:
         ValueError: If the innermost environment is not an `NCSVectorEnv`.
@@ -299,12 +289,9 @@ class EstimateFilter(VectorWrapper):
 
 @dataclass(frozen=True)
 class EstimateFilterSettings:
-    """Settings of a filter around a vector environment, which calling it puts there (`LoopConfig.filter`).
+    """Settings of a filter of `FILTERS` around a vector environment, which calling it puts there (`LoopConfig.filter`).
 
-    Attributes:
-        name: A name in `FILTERS`.
-        certificate: Certificate of the safe set; it is verified when the filter is built.
-        penalty: Subtracted from the reward per intervention.
+    The penalty is subtracted from the reward per intervention.
     """
 
     name: str

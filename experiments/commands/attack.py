@@ -116,10 +116,7 @@ def channels_of(own: Channel, contract: ChannelContract | None) -> dict[str, Cha
 
 
 def worst_case(certificate: Certificate, mode: str = "project") -> dict[str, Any]:
-    """Returns the noise and disturbance of an environment that push the next state farthest out of the safe set.
-
-    In mode "lookahead", which may leave that set, they push it out of the box.
-    """
+    """Returns settings of environments that push states out of the safe set, in mode "lookahead" out of the box."""
     push = {"M": certificate.M} if certificate.polytope is None else {"rows": certificate.polytope.rows}
     return {"noise": "extreme", "disturbance": AdversarialDisturbance(**({} if mode == "lookahead" else push))}
 
@@ -133,10 +130,7 @@ def starts(certificate: Certificate, rng: np.random.Generator, count: int, reach
 def hostile_agents(
     certificate: Certificate, plant: LinearPlant, count: int, rng: np.random.Generator
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns the actions (N, m) of agents that see estimates (N, n).
-
-    They are, a quarter each, random, outwards, the certified gain turned round, and bang-bang.
-    """
+    """Returns what makes actions (N, m) of estimates (N, n): random, outwards, the gain turned round, bang-bang."""
     outwards = (plant.B.T @ certificate.M @ plant.A).T
     turned = -1e3 * (certificate.K / plant.input_half[:, None]).T
     signs, kinds = rng.choice([-1.0, 1.0], (count, plant.m)), 4 * np.arange(count)[:, None] // count

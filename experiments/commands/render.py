@@ -32,8 +32,8 @@ class RenderSettings:
     Attributes:
         env: Id of an environment with a plant of its own, or module:id.
         out: File to write: .gif, or .png for the last frame alone.
-        policy: "lqr", "mpc", "zero", "random", "pretrained" (the small agent of the package), or the folder of a
-            trained agent.
+        policy: lqr, mpc, zero-input, random, pretrained (the small agent of the package), or the folder of a trained
+            agent.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         side_by_side: Draw the same episode without a shield at the left, with it at the right.

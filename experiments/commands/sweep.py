@@ -30,10 +30,8 @@ class SweepSettings(LearningSettings):
     common is given as --channel.
 
     Attributes:
-        out: Output folder; created if it does not exist.
+        out: Output folder.
         seeds: Number of paired training runs per arm and channel.
-        steps: Training steps per run, rounded up to whole rollouts.
-        episodes: Evaluation episodes per run.
         arms: Arms of the comparison; see `ncs compare`.
         losses: Loss probabilities of the grid.
         delays: Delays of the grid [steps].

@@ -35,15 +35,7 @@ _SQUARED = "\N{SUPERSCRIPT TWO}"
 
 
 class CaptionedFigure(Figure):
-    """A figure of matplotlib with a caption.
-
-    Args:
-        size: Width and height [inches].
-        caption: Text below the figure.
-
-    Attributes:
-        caption: Text below the figure.
-    """
+    """A figure of matplotlib of a size [inches], with a `caption`."""
 
     def __init__(self, size: tuple[float, float], caption: str = "") -> None:
         super().__init__(figsize=size, layout="constrained")
@@ -85,7 +77,7 @@ def thousands(value: float, _: object = None) -> str:
 
 
 def _width(names: list[str], columns: int) -> float:
-    """Returns about how wide a legend is [inches]; matplotlib fills one column after the other."""
+    """Returns about how wide a legend is [inches], whose columns are filled one after the other."""
     return sum(_LETTER * max(map(len, part)) + _HANDLE for part in np.array_split(np.array(names), columns))
 
 
@@ -109,14 +101,7 @@ _DASHES: tuple[Any, ...] = ("-", (0, (4.5, 1.6)), (0, (1.0, 1.3)))
 
 @dataclass(frozen=True)
 class ArmStyle:
-    """Style of an arm.
-
-    Attributes:
-        color: Hexadecimal color.
-        marker: Marker of matplotlib.
-        dashes: Line style of matplotlib.
-        size: Size of the markers [points].
-    """
+    """Style of an arm, in matplotlib's words; the size of markers is in points."""
 
     color: str
     marker: str

@@ -22,9 +22,7 @@ def summary_text(arms: _Arms, baselines: _Arms) -> str:
     """Returns the tables of training and evaluation for a terminal; baselines stand below a rule.
 
     Violating episodes have their exact interval, the return has Student's (`experiments.analysis.episodes`). "Outside
-    S" counts episodes in which the true state was outside the safe set at some step, be it the first one, "from a plan"
-    the steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store. The training
-    of those that were trained has a table of its own, scenarios are parts of that of the evaluation.
+    S" counts episodes. Scenarios are parts of the table of the evaluation.
     """
     everything = arms | baselines
     trained = {name: arm for name, arm in everything.items() if arm["train_steps"]}
@@ -39,7 +37,7 @@ def summary_text(arms: _Arms, baselines: _Arms) -> str:
 
 
 def _text(corner: str, parts: dict[str, _Arms], columns: list[_Column], above: int = 0) -> str:
-    """Returns a table with a part per scenario, in which a rule follows so many arms."""
+    """Returns a table with a part per scenario, in which a rule follows `above` arms."""
     first, second = zip(*(header for header, _ in columns), strict=True)
     rows, rules = [[corner, *first], ["", *second]], []
     for title, arms in parts.items():

@@ -44,7 +44,7 @@ class Arm:
     """How the agents of an arm are trained and evaluated.
 
     Attributes:
-        name: Name of the arm.
+        name: Its full name.
         mode: Mode of the shield, or name of another filter in `FILTERS`; None for neither.
         policy: What acts: "trained" for a trained agent.
         penalizes_interventions: Whether the training reward is reduced per intervention.
@@ -183,8 +183,7 @@ def require_arms(settings: LearningSettings, loop: LoopConfig, names: Sequence[s
     """Raises what arms cannot do in an environment, as far as that is known without a certificate.
 
     Raises:
-        ValueError: If an arm or a scenario is unknown, an arm cannot pursue the task, a scenario cannot be simulated,
-            or agents cannot be trained with the hyperparameters given.
+        ValueError: If an arm or a scenario is unknown or impossible, or the hyperparameters train nothing.
     """
     for each in settings.by_algorithm:
         require_trainable(each, loop)
@@ -214,7 +213,7 @@ def run_of_arm(
     index: int,
     grid_point: str = "",
 ) -> TrainingRun:
-    """Returns one training run of an arm, or the run of an arm in which nothing is trained.
+    """Returns one run of an arm.
 
     Raises:
         ValueError: If the arm or a scenario is unknown.

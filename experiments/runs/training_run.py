@@ -35,13 +35,13 @@ class RunResult:
     Attributes:
         arm: Name of the run's arm.
         index: Number of the run within its arm.
-        train_steps: Number of training steps; 0 if nothing was trained.
-        train_violation_steps: Number of training steps whose true state violated the safe box.
-        train_interventions: Number of training steps in which the shield intervened.
+        train_steps: Training steps; 0 if nothing was trained.
+        train_violation_steps: Training steps whose true state violated the safe box.
+        train_interventions: Training steps in which the shield intervened.
         history: Running totals during the training.
         episodes: Evaluation episodes.
-        files: Contents of the trained agent's files by name; empty if nothing was trained.
-        scenarios: Evaluation episodes under other scenarios than that of the training, by the scenario's name.
+        files: Contents of the trained agent's files by name.
+        scenarios: Evaluation episodes under other scenarios by name.
     """
 
     arm: str
@@ -77,20 +77,20 @@ class TrainingRun:
     """Settings of one training run.
 
     Attributes:
-        arm: Name of the arm that the run belongs to.
+        arm: Name of its arm.
         policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; "pretrained" the one
             that comes with the package, in `agent_files`; the others are controllers (`experiments.baselines`).
         training_loop: Control loop that the policy is trained in, with its penalties.
         loop: Control loop that the policy is evaluated in.
-        module: Module of the user's that registers the environment, imported where the run is executed; empty for none.
+        module: Module of the user's that registers the environment, imported where the run is executed.
         seed: Seed of the experiment.
         index: Number of the run within its arm; runs with equal index are paired across arms.
         steps: Training steps.
         episodes: Evaluation episodes.
-        certificate: Certificate of shield or filter, which also defines x'Mx and the gain of controllers.
-        scenarios: Scenarios that the policy is evaluated under besides that of its training.
-        algorithm: Name of the learning algorithm, one of `agents.hyperparams.ALGORITHMS`.
-        settings: Hyperparameters of the learning algorithm.
+        certificate: Certificate of shield or filter, which also defines `times_safe_set` and the gain of controllers.
+        scenarios: Further scenarios that the policy is evaluated under.
+        algorithm: A name in `agents.hyperparams.ALGORITHMS`.
+        settings: Its hyperparameters.
         grid_point: Name of the point of a sweep's grid; part of the run's name only.
         agent_files: Files of an agent that was trained before: it is evaluated, and nothing is trained.
     """
@@ -113,12 +113,12 @@ class TrainingRun:
 
     @property
     def trains(self) -> bool:
-        """Whether an agent is trained in this run."""
+        """Whether an agent is trained."""
         return self.policy_kind == "trained" and not self.agent_files
 
     @property
     def name(self) -> str:
-        """Name of the run in file names and progress lines."""
+        """Name in file names and progress lines."""
         return "-".join(filter(None, (self.grid_point, self.arm, str(self.index)))).replace(" ", "-").replace(":", "-")
 
     @property

@@ -10,7 +10,6 @@ from agents import SB3VecEnv
 from agents.loop import CostPenalty
 from ncs_gym import (
     Channel,
-    RandomChannel,
     RequestActions,
     VectorNetworked,
     VectorRandomChannel,
@@ -102,10 +101,3 @@ def test_prices_of_wrappers_may_change_and_are_those_of_their_specs(make, name):
     with pytest.raises(ValueError, match=f"{name} must be a number >= 0"):
         setattr(env, name, -3.0)
     assert getattr(env, name) == 0.5
-
-
-def test_what_random_channels_draw_from_is_that_of_their_spec():
-    env = RandomChannel(gym.make(ID), [Channel(loss=0.1)])
-    assert gym.make(env.spec).reset(seed=0)[1]["channel_loss"] == 0.1
-    env.draw_from([Channel(loss=0.5)])
-    assert gym.make(env.spec).reset(seed=0)[1]["channel_loss"] == 0.5

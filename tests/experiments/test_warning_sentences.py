@@ -3,12 +3,11 @@
 import re
 import sys
 import warnings
-from queue import Queue
 
 import pytest
 from tqdm import tqdm
 
-from experiments.terminal import warnings_as_sentences, warnings_sent
+from experiments.terminal import warnings_as_sentences
 from tests.command import ncs
 
 # Samples may become older than the contract allows from a delay of 5 steps on.
@@ -39,10 +38,3 @@ def test_progress_bar_is_cleared_before_a_sentence(capsys):
             warnings.warn(text, stacklevel=1)
     said = [line for line in lines_of(capsys.readouterr().err) if "warning" in line]
     assert said == ["ncs: warning: one sentence", "ncs: warning: another"]
-
-
-def test_warnings_of_a_worker_reach_the_command():
-    sent: Queue = Queue()
-    with warnings_sent(sent.put):
-        warnings.warn("from a run", stacklevel=1)
-    assert sent.get_nowait() == "from a run"

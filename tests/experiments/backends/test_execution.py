@@ -33,17 +33,6 @@ def stored(folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("jobs", [2, 1])
-def test_results_are_those_of_this_process_whatever_the_number_of_jobs(jobs, certificate, tmp_path):
-    runs = [training_run(certificate, arm="random", policy_kind="random", index=index) for index in range(3)]
-    results = results_of(runs, tmp_path, BackendSettings(jobs=jobs))
-    for run, result in zip(runs, results, strict=True):
-        alone = run.execute(lambda steps: None)
-        assert result.episodes == alone.episodes
-    assert results[0].episodes != results[1].episodes
-
-
-@pytest.mark.slow
 def test_finished_runs_are_kept_and_not_executed_again(tmp_path, capsys):
     runs = [Small(name, "work", tmp_path) for name in "abc"]
     with pytest.warns(UserWarning, match=r"[ab] warns"):

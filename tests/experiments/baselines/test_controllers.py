@@ -106,27 +106,6 @@ def test_regulator_of_the_speed_removes_the_error():
     assert abs(left) < 0.05
 
 
-def test_fallback_applies_its_gain_and_zero_nothing():
-    env, K = env_of("ncs_gym/TruckTrailer-v0"), np.array([[0.3, -0.2]])
-    estimates = np.array([[0.5, -0.1], [9.0, -9.0]])
-    actions = controller("K x_hat", env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates})
-    np.testing.assert_allclose(actions, np.clip(estimates @ K.T / env.plant.u_max, -1.0, 1.0))
-    assert not controller("zero input", env, Fallback.of_gain(K), 0)(estimates, {"estimate": estimates}).any()
-
-
-@pytest.mark.cases(6)
-@pytest.mark.parametrize("name", CONTROLLERS)
-@pytest.mark.parametrize("env_id", [*SETPOINTS, "ncs_gym/TruckTrailer-v0", "ncs_gym/TruckTrailerCruise-v0"])
-def test_actions_of_every_controller_fit_every_environment(name, env_id):
-    env = env_of(env_id)
-    rng, (m, n) = np.random.default_rng(0), (env.plant.m, env.plant.n)
-    policy = controller(name, env, Fallback.of_gain(rng.standard_normal((m, n))), 0)
-    observations = rng.standard_normal((7, *env.observation_space.shape)).astype(np.float32)
-    actions = policy(observations, {"estimate": observations[:, :n].astype(np.float64)})
-    assert actions.shape == (7, m)
-    assert np.abs(actions).max() <= 1.0
-
-
 def nominal(env, name, weights, steps=150, times=1):
     """Largest |c_j x| on the way from rest to the outermost target, without disturbance, and the inputs applied.
 

@@ -32,6 +32,7 @@ def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_oth
     for run in runs_of(certificate, arms=ALL_ARMS):
         seeds.setdefault(run.index, set()).add((run.training_seed, run.evaluation_seed))
     assert {len(pairs) for pairs in seeds.values()} == {1}
+    assert all(0 <= run.training_seed < 2**31 for run in runs_of(certificate, seed=2**63))
     flat = [number for pairs in seeds.values() for pair in pairs for number in pair]
     assert len(set(flat)) == len(flat) == 6
 
@@ -46,33 +47,14 @@ def test_a_smoke_run_evaluates_the_pretrained_agent_unless_something_else_is_ask
     assert shortened(CompareSettings()) == CompareSettings()
 
 
-@pytest.mark.parametrize("seed", [0, 10**9, 2**63])
-def test_any_seed_is_usable(certificate, seed):
-    for run in runs_of(certificate, seed=seed):
-        assert 0 <= run.training_seed < 2**31
-        assert 0 <= run.evaluation_seed < 2**31
-
-
 def test_each_arm_has_its_shield_and_its_penalties(certificate):
     chosen = runs_of(
         certificate, arms=ALL_ARMS, seeds=1, mode="switch", intervention_penalty=0.3, violation_penalty=2.0
     )
     loops = {run.arm: run.training_loop for run in chosen}
-    modes = {name: loop.shield and loop.shield.mode for name, loop in loops.items()}
-    assert modes == {
-        "unshielded": None,
-        "monitor": "monitor",
-        "penalized": None,
-        "shielded": "switch",
-        "shielded:switch+penalty": "switch",
-        "shielded:boundary": "boundary",
-        "zero input": None,
-        "K x_hat": None,
-        "untrained": None,
-        "lqr": None,
-        "lqr+trusting": None,
-        "lqr+shielded": "switch",
-    }
+    modes = {name: loop.shield.mode for name, loop in loops.items() if loop.shield}
+    switched = dict.fromkeys(("shielded", "shielded:switch+penalty", "lqr+shielded"), "switch")
+    assert modes == switched | {"monitor": "monitor", "shielded:boundary": "boundary"}
     penalized = {name for name, loop in loops.items() if loop.shield and loop.shield.penalty == 0.3}
     assert penalized == {"shielded:switch+penalty"}
     assert {name for name, loop in loops.items() if loop.violation_penalty == 2.0} == {"penalized"}
