@@ -17,7 +17,6 @@ from ncs_gym.installation import install_command
 
 if TYPE_CHECKING:
     from agents.agent import Agent, pretrained
-    from agents.algorithms import AppliedActionBuffer
     from agents.callbacks import DualAscentCallback, SafetyCallback
     from agents.sb3_vec_env import SB3VecEnv
     from agents.training import TrainingResult, train, untrained
@@ -27,7 +26,6 @@ __distribution__ = "ncs-gym"
 __all__ = [
     "Agent",
     "AgentError",
-    "AppliedActionBuffer",
     "DualAscentCallback",
     "Episode",
     "Evaluation",

@@ -84,8 +84,11 @@ def _played(
     totals = {name: np.zeros(count, np.int64) for name in names}
     while True:
         guaranteed &= info.get("shield_guaranteed", nothing).astype(np.bool_) | ~running
-        if safe_set is not None:
-            largest = np.maximum(largest, np.where(running, _times(info["state"], safe_set), 0.0))
+        if isinstance(safe_set, Polytope):
+            largest = np.maximum(largest, np.where(running, safe_set.gauge(info["state"]), 0.0))
+        elif safe_set is not None:
+            levels = np.einsum("ei,ij,ej->e", info["state"], safe_set, info["state"])
+            largest = np.maximum(largest, np.where(running, np.sqrt(np.maximum(levels, 0.0)), 0.0))
         running &= ~ended
         if not running.any():
             break
@@ -118,10 +121,3 @@ def _played(
         )
         for e, index in enumerate(indices)
     ]
-
-
-def _times(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
-    """Returns how many times a safe set holds states, shape (N, n): 1 on its boundary."""
-    if isinstance(of, Polytope):
-        return of.gauge(states)
-    return np.sqrt(np.maximum(np.einsum("ei,ij,ej->e", states, of, states), 0.0))

@@ -7,9 +7,7 @@ and these names are no arguments of the constructor:
 - `n_envs`: number of environments stepped side by side;
 - `normalize`: true, or arguments of `VecNormalize` such as `{"norm_reward": false}`;
 - `noise_std`: exploration noise of off-policy algorithms, in units of the limits;
-- `policy_kwargs`: may have `activation_fn`, an activation function of `torch.nn` by its name, such as "nn.ReLU";
-- `stored_action`: of off-policy algorithms, "applied" to learn from the actions that the shield applied, "proposed"
-  (the default) from the agent's own.
+- `policy_kwargs`: may have `activation_fn`, an activation function of `torch.nn` by its name, such as "nn.ReLU".
 
 `agents/tuned/ppo.json` has those found by a search for each registered environment (docs/agents.md).
 """

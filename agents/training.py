@@ -15,12 +15,12 @@ from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization, require_kept
-from agents.algorithms import AppliedActionBuffer, build_model, normalized_env
+from agents.algorithms import build_model, normalized_env
 from agents.callbacks import OTHERS, DualAscentCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
 from agents.results import TrainingPoint
-from agents.sb3_vec_env import INFO_KEYWORDS, SB3VecEnv
+from agents.sb3_vec_env import SB3VecEnv
 from ncs_gym.validation import counted, reason_of, warn_caller
 
 # Observations that the normalization of an agent to go on from counts as.
@@ -126,9 +126,8 @@ def _trainable(
             f"of {algorithm} keeps rewards with the price of a violation that there was when they were collected"
         )
     envs = loop.vector(hyperparams["n_envs"])
-    stores_applied = hyperparams.get("stored_action") == "applied"
     try:
-        seen = SB3VecEnv(envs, info_keywords=AppliedActionBuffer.info_keywords if stores_applied else INFO_KEYWORDS)
+        seen = SB3VecEnv(envs)
     except ValueError as error:
         raise ValueError(f"{loop.env}: {error}; {OTHERS}") from error
     env = normalized_env(algorithm, seen, hyperparams)

@@ -56,7 +56,13 @@ def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSetti
 
     if missing:
         counts = multiprocessing.get_context("spawn").RawArray("q", len(missing) + 1)
-        execute(missing, counts, _engine(settings, len(missing), counts, folder / "tensorboard"), keep)
+        if settings.engine == "ray":
+            from experiments.backends.ray_tasks import ray_tasks  # needs the extra "ray"
+
+            where = ray_tasks(settings.ray_address)
+        else:
+            where = local_workers(min(settings.jobs, len(missing)), counts, folder / "tensorboard")
+        execute(missing, counts, where, keep)
     return [results[run.name] for run in runs]
 
 
@@ -96,15 +102,6 @@ def load(folder: Path, run: TrainingRun) -> RunResult | None:
     except (OSError, LookupError, TypeError, ValueError, RecursionError):
         say(f"{path} is damaged: its run is done again")
         return None
-
-
-def _engine(settings: BackendSettings, runs: int, counts: Any, log_folder: Path) -> AbstractContextManager[Engine]:
-    """Returns where runs are executed; TensorBoard's events are left by workers of this machine alone."""
-    if settings.engine == "ray":
-        from experiments.backends.ray_tasks import ray_tasks  # needs the extra "ray"
-
-        return ray_tasks(settings.ray_address)
-    return local_workers(min(settings.jobs, runs), counts, log_folder)
 
 
 def execute(

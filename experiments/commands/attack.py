@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -14,14 +13,13 @@ import gymnasium as gym
 import numpy as np
 
 from experiments.runs.loops import registered_env
-from experiments.runs.output_folder import require_place
+from experiments.runs.output_folder import require_place, write_json
 from experiments.settings import id_alone, require_horizon, require_limits
 from experiments.terminal import progress_bar, say, text_table, wrapped
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, LinearPlant
 from ncs_gym.registration import EPISODE_STEPS, registered_ids
 from ncs_gym.validation import counted
 from shields import Certificate, VectorSafetyShield, certificate_for
-from shields.atomic_write import write_atomically
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +92,7 @@ def attack(settings: AttackSettings) -> None:
             rows[f"{id_alone(env_id).removeprefix('ncs_gym/')}, {kind}"] = counts
             failed.update(counts)
     print(table_of(rows))
-    if settings.out is not None:
-        write_atomically(settings.out, json.dumps(rows, indent=1) + "\n")
+    write_json(settings.out, rows)
     wrong = {"outside the box": failed["guaranteed outside box"]}
     if settings.mode != "lookahead":
         wrong["outside S"] = failed["guaranteed outside S"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,13 @@ import tyro
 
 from experiments.analysis.stalls import broken_contracts, how_often, rate_text
 from experiments.runs.loops import registered_env
-from experiments.runs.output_folder import require_place
+from experiments.runs.output_folder import require_place, write_json
 from experiments.terminal import text_table, wrapped
 from ncs_gym import LinearPlant, PacketLog
 from ncs_gym.network.channel import in_time
 from ncs_gym.network.contract import MAX_AGE
 from ncs_gym.validation import counted
 from shields import Certificate, silence_of
-from shields.atomic_write import write_atomically
 from shields.packaged_certificates import certificate_of_package
 
 
@@ -105,8 +103,7 @@ def channel(settings: ChannelSettings) -> None:
                 "meanwhile, the box is left no more often."
             )
         )
-    if settings.out is not None:
-        write_atomically(settings.out, json.dumps(found, indent=1) + "\n")
+    write_json(settings.out, found)
 
 
 def _numbers(log: PacketLog, dt: float, asked: list[int]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -14,7 +13,7 @@ from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary
 from experiments.report.text_tables import summary_text
 from experiments.runs.loops import certificate_of, registered_env, with_channel
-from experiments.runs.output_folder import require_place
+from experiments.runs.output_folder import require_place, write_json
 from experiments.runs.policies import agent_named, certificate_file
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import RunResult
@@ -22,7 +21,6 @@ from experiments.settings import Assignments, id_alone, require_horizon, require
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
-from shields.atomic_write import write_atomically
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,11 +62,9 @@ class EvaluateSettings:
 def evaluate(settings: EvaluateSettings) -> None:
     """Runs `ncs evaluate`."""
     require_place(settings.out)
-    env_id = None
     if settings.env is not None:
         registered_env(settings.env)
-        env_id = id_alone(settings.env)
-    agent, folder = agent_named(str(settings.model), env_id)
+    agent, folder = agent_named(str(settings.model), settings.env and id_alone(settings.env))
     loop = LoopConfig(env=agent.env, kwargs=agent.env_kwargs)
     if settings.between_samples is not None:
         loop = loop.with_kwargs(between_samples=settings.between_samples)
@@ -100,18 +96,17 @@ def evaluate(settings: EvaluateSettings) -> None:
         (arm,) = arms.values()
         held = f"{arm['eval_proved_steps']:,} of {counted(arm['eval_steps'], 'step')}"
         print(wrapped(f"The guarantee held after {held}."))
-    if settings.out is not None:
-        content = {
-            "arms": arms,
-            "env": agent.env,
-            "channel": loop.channel and asdict(loop.channel),
-            "kwargs": others,
-            "horizon": shield and shield.horizon,
-            "episodes": settings.episodes,
-            "seed": settings.seed,
-            "model": {"folder": str(folder), "sha256": agent.checksum},
-            "plant": ncs_env(loop.single()).plant.fingerprint,
-            "certificate": certificate.checksum,
-            "versions": versions(),
-        }
-        write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+    content = {
+        "arms": arms,
+        "env": agent.env,
+        "channel": loop.channel and asdict(loop.channel),
+        "kwargs": others,
+        "horizon": shield and shield.horizon,
+        "episodes": settings.episodes,
+        "seed": settings.seed,
+        "model": {"folder": str(folder), "sha256": agent.checksum},
+        "plant": ncs_env(loop.single()).plant.fingerprint,
+        "certificate": certificate.checksum,
+        "versions": versions(),
+    }
+    write_json(settings.out, content)

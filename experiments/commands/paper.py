@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -17,14 +16,13 @@ import numpy as np
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
 from experiments.plots.figure_style import STYLE, CaptionedFigure
-from experiments.runs.output_folder import claim_folder, write_results
+from experiments.runs.output_folder import claim_folder, write_json, write_results
 from experiments.settings import require_limits
 from experiments.terminal import text_table, wrapped
 from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
 from ncs_gym.registration import CASE_STUDY_BOX
 from shields import paper as published
 from shields import synthesize
-from shields.atomic_write import write_atomically
 from shields.paper.bounds import with_noise
 from shields.paper.feasibility import FeasibilityScan, largest_scale
 
@@ -64,8 +62,7 @@ def paper(settings: PaperSettings) -> None:
         claims = list(audited_claims(PaperExample()))
         print(text_of(claims))
         if settings.out is not None:
-            content = [asdict(claim) for claim in claims]
-            write_atomically(settings.out / "claims.json", json.dumps(content, indent=1) + "\n")
+            write_json(settings.out / "claims.json", [asdict(claim) for claim in claims])
         return
     chosen = designs()
     played = [simulated(design, settings) for design in chosen]

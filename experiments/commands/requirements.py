@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import shields
 from experiments.runs.loops import plant_in_use
-from experiments.runs.output_folder import require_place
+from experiments.runs.output_folder import require_place, write_json
 from experiments.settings import PlantSettings
 from experiments.terminal import text_table, wrapped
 from ncs_gym import LinearPlant
 from ncs_gym.network.channel import in_time
 from ncs_gym.validation import counted
-from shields.atomic_write import write_atomically
 from shields.packaged_certificates import synthesis_status
 from shields.synthesis.network_requirements import AGES, share_of
 
@@ -72,7 +70,7 @@ def requirements(settings: RequirementsSettings) -> None:
     if settings.out is not None:
         documents = {checksum: certificate.document for checksum, certificate in certified.items()}
         content = found.document | {"plant": plant.fingerprint, "documents": documents}
-        write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+        write_json(settings.out, content)
         print(f"saved to {settings.out}")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -11,13 +10,12 @@ import tyro
 
 import shields
 from experiments.runs.loops import PlantInUse, plant_in_use, registered_env
-from experiments.runs.output_folder import require_place
+from experiments.runs.output_folder import require_place, write_json
 from experiments.settings import PlantSettings
 from experiments.terminal import wrapped
 from ncs_gym.registration import registered_ids
 from ncs_gym.validation import counted
 from shields import Certificate, CertificateError
-from shields.atomic_write import write_atomically
 from shields.export import export_c
 from shields.held import held_text
 
@@ -50,10 +48,8 @@ def verify(settings: VerifySettings) -> None:
     plant, origin = found.plant, found.origin
     report = shields.verify(certificate, plant)
     print(f"{settings.file}\nagainst the plant of {origin}:\n{report}")
-    if settings.out is not None:
-        conditions = [asdict(condition) for condition in report.conditions]
-        document = {"env": origin, "valid": report.valid, "conditions": conditions}
-        write_atomically(settings.out, json.dumps(document, indent=1) + "\n")
+    conditions = [asdict(condition) for condition in report.conditions]
+    write_json(settings.out, {"env": origin, "valid": report.valid, "conditions": conditions})
     if not report.valid:
         if plant.fingerprint != certificate.fingerprint:
             raise CertificateError(

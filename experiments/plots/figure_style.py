@@ -63,10 +63,14 @@ def label(axis: Axes, x: str, y: str, title: str = "") -> None:
     axis.set_title(title)
 
 
-def legend_below(figure: Figure, handles: dict[str, Artist], rows: int = 1) -> None:
-    """Puts one legend below a figure, where it covers no data, in at least `rows` rows and as many as it needs."""
-    names, columns = list(handles), max(1, -(-len(handles) // rows))
-    while columns > 1 and _width(names, columns) > figure.get_figwidth():
+def legend_below(figure: Figure, handles: dict[str, Artist]) -> None:
+    """Puts one legend below a figure, where it covers no data, in as many rows as it needs."""
+    names, columns = list(handles), len(handles)
+
+    def width() -> float:  # about how wide it is [inches]: one column after the other is filled
+        return sum(_LETTER * max(map(len, part)) + _HANDLE for part in np.array_split(np.array(names), columns))
+
+    while columns > 1 and width() > figure.get_figwidth():
         columns -= 1
     figure.legend(list(handles.values()), names, loc="outside lower center", ncols=columns)
 
@@ -74,11 +78,6 @@ def legend_below(figure: Figure, handles: dict[str, Artist], rows: int = 1) -> N
 def thousands(value: float, _: object = None) -> str:
     """Returns a tick's text with thousands separators and a true minus sign."""
     return f"{value:,.12g}".replace("-", "\N{MINUS SIGN}")
-
-
-def _width(names: list[str], columns: int) -> float:
-    """Returns about how wide a legend is [inches], whose columns are filled one after the other."""
-    return sum(_LETTER * max(map(len, part)) + _HANDLE for part in np.array_split(np.array(names), columns))
 
 
 # Colors (after Okabe and Ito, which color-blind readers can distinguish) and markers (for print without color).

@@ -12,7 +12,6 @@ from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines import (
     CONTROLLERS,
     FILTERS,
-    MARGINS,
     REGULATORS,
     EstimateFilterSettings,
     tuned_training,
@@ -30,9 +29,8 @@ _SHIELD_MODES = tuple(mode for mode in MODES if mode != "monitor")
 _POLICIES = (*CONTROLLERS, *REGULATORS, "untrained", PRETRAINED)
 _KNOWN_ARMS = (
     "unshielded, monitor, penalized[:WEIGHT], lagrangian[:LIMIT], FILTER, FILTER+penalty, 'FILTER at test', POLICY and "
-    f"POLICY+FILTER, with FILTER one of shielded[:MODE], lookahead, trusting[:MARGIN], psf[:MARGIN], psf:tube and "
-    f"POLICY one of untrained, {PRETRAINED}, {', '.join(CONTROLLERS)}, lqr[:observer], mpc[:observer], "
-    f"mpc[:MARGIN] (modes: {', '.join(_SHIELD_MODES)}; margins in percent: {', '.join(map(str, MARGINS))})"
+    f"POLICY+FILTER, with FILTER one of shielded[:MODE], lookahead, {', '.join(FILTERS)} and POLICY one of "
+    f"{', '.join(_POLICIES)} (modes: {', '.join(_SHIELD_MODES)})"
 )
 
 # Results of the training runs of each arm, in the order of their indices.

@@ -117,7 +117,7 @@ def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs:
 def with_channel(loop: LoopConfig, changes: Mapping[str, Any]) -> LoopConfig:
     """Returns a control loop with changes of its channel; see `changed_channel`."""
     changed = changed_channel(ncs_env(loop.single()).channel, changes)
-    return loop if changed is None else loop.with_kwargs(channel=asdict(changed))
+    return loop if changed is None else _on(loop, changed)
 
 
 def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
@@ -131,20 +131,15 @@ def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
     for name in given.keys() - set(known):
         raise ValueError(f"--channel {name}: a channel has no such setting; known are {', '.join(known)}")
     changed = replace(own, **given)
-    if "loss" in given and "max_consecutive_losses" not in given and (text := fewer_losses(changed)):
-        warn_caller(text, UserWarning)
+    most, wanted = changed.max_consecutive_losses, replace(changed, max_consecutive_losses=None).mean_loss
+    is_asked = "loss" in given and "max_consecutive_losses" not in given
+    if is_asked and most is not None and changed.mean_loss < wanted - _SHARE:
+        warn_caller(
+            f"{changed.mean_loss:.3g} of the packets are lost in the long run, not {wanted:.3g}: the channel loses at "
+            f"most {most} in a row",
+            UserWarning,
+        )
     return None if changed == own else changed
-
-
-def fewer_losses(channel: Channel) -> str:
-    """Returns that a channel with a limit of losses in a row loses fewer packets than its `loss` says; else nothing."""
-    most, wanted = channel.max_consecutive_losses, replace(channel, max_consecutive_losses=None).mean_loss
-    if most is None or channel.mean_loss >= wanted - _SHARE:
-        return ""
-    return (
-        f"{channel.mean_loss:.3g} of the packets are lost in the long run, not {wanted:.3g}: the channel loses at most "
-        f"{most} in a row"
-    )
 
 
 # The scenario that agents are trained under.
@@ -204,29 +199,29 @@ def _more_loss(loss: float | GilbertElliott) -> float | GilbertElliott:
     return 0.5 * (1.0 + loss)
 
 
-def _on_worse_channel(loop: LoopConfig) -> LoopConfig:
+def _on(loop: LoopConfig, channel: Channel) -> LoopConfig:
+    return loop.with_kwargs(channel=asdict(channel))
+
+
+def _worsened(loop: LoopConfig) -> LoopConfig:
     env = ncs_env(loop.single())
-    return loop.with_kwargs(channel=asdict(worse_channel(env.channel, env.contract)))
-
-
-def _on_ideal_channel(loop: LoopConfig) -> LoopConfig:
-    return loop.with_kwargs(channel=asdict(Channel()))
+    return _on(loop, worse_channel(env.channel, env.contract))
 
 
 def _attacked(loop: LoopConfig) -> LoopConfig:
     """Returns a loop with the disturbance that does the most harm, noise of full size, and bursts at their longest."""
     own = ncs_env(loop.single()).channel
     worst = own if own.most_consecutive_losses == 0 else replace(own, loss=1.0)
-    return loop.with_kwargs(disturbance="adversarial", noise="extreme", channel=asdict(worst))
+    return _on(loop.with_kwargs(disturbance="adversarial", noise="extreme"), worst)
 
 
 _CHANGES: dict[str, Callable[[LoopConfig], LoopConfig]] = {
     "worst-case disturbance": lambda loop: loop.with_kwargs(disturbance="adversarial"),
-    "worse channel": _on_worse_channel,
+    "worse channel": _worsened,
     "gaussian": lambda loop: loop.with_kwargs(noise="gaussian"),
-    "ideal channel": _on_ideal_channel,
+    "ideal channel": lambda loop: _on(loop, Channel()),
     "attacked": _attacked,
-    "attacked on an ideal channel": lambda loop: _on_ideal_channel(_attacked(loop)),
+    "attacked on an ideal channel": lambda loop: _on(_attacked(loop), Channel()),
 }
 
 

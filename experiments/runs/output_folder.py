@@ -30,13 +30,13 @@ def claim_folder(command: str, settings: Any) -> None:
             the settings do not `force` it.
         OSError: If the folder cannot be written.
     """
-    folder, file = settings.out, settings.out / "settings.json"
+    folder = settings.out
     content = {"command": command, "settings": lasting_settings(settings)}
     if not settings.force and (problem := _problem(folder, content)):
         raise OtherResultsError(f"{folder} holds {problem}: give another --out, or --force to replace it")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "summary.json").unlink(missing_ok=True)
-    write_atomically(file, json.dumps(content, indent=1) + "\n")
+    write_json(folder / "settings.json", content)
 
 
 def _problem(folder: Path, content: dict[str, Any]) -> str:
@@ -57,6 +57,12 @@ def _problem(folder: Path, content: dict[str, Any]) -> str:
     others = [f"{name} {kept.get(name)}, now {own.get(name)}" for name in names]
     listed = "; ".join([*others[:_MOST_LISTED], *["..."] * (len(others) > _MOST_LISTED)])
     return listed and f"results of other settings ({listed})"
+
+
+def write_json(path: Path | None, content: Any) -> None:
+    """Writes JSON values into a file if there is a path; raises OSError if it cannot be written."""
+    if path is not None:
+        write_atomically(path, json.dumps(content, indent=1) + "\n")
 
 
 def write_results(

@@ -1,18 +1,14 @@
-"""Trainings that go on from an agent, and that learn what was applied."""
+"""Trainings that go on from an agent."""
 
 import copy
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback
 
-from agents import AppliedActionBuffer, LoopConfig, ShieldSettings, train
+from agents import LoopConfig, ShieldSettings, train
 from ncs_gym import truck_trailer
 from tests.certificates import certificate_of
-from tests.product import safety_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 SMALL = {"n_envs": 8, "n_steps": 16, "batch_size": 128, "n_epochs": 2}
@@ -51,38 +47,3 @@ def test_agent_that_a_training_goes_on_from_stays_as_it_is(loop, algorithm):
     for name, values in before.items():
         torch.testing.assert_close(after[name], values, rtol=0.0, atol=0.0)
     assert second.checksum == third.checksum
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("algorithm", ["SAC", "TD3"])
-def test_replay_buffers_hold_what_was_applied_if_asked_to(loop, algorithm):
-    class Keeping(BaseCallback):
-        def __init__(self):
-            super().__init__()
-            self.applied = []
-
-        def _on_step(self):
-            self.applied += self.training_env.unwrapped.batch_info["input"].tolist()
-            return True
-
-    keeping, limit = Keeping(), truck_trailer().u_max
-    agent = train(loop, 120, 0, algorithm, REPLAY | {"stored_action": "applied"}, callbacks=[keeping]).agent
-    stored = agent.model.replay_buffer
-    actions = stored.actions[: stored.pos].reshape(-1, 1)
-    np.testing.assert_allclose(actions * limit, np.array(keeping.applied), atol=1e-5)
-    proposed = train(loop, 120, 0, algorithm, REPLAY).agent.model.replay_buffer
-    assert not np.allclose(proposed.actions[: stored.pos].reshape(-1, 1), actions, atol=1e-3)
-
-
-def test_replay_buffers_refuse_actions_that_a_wrapper_outside_changes():
-    def learn(env):
-        model = SAC("MlpPolicy", env, learning_starts=50, replay_buffer_class=AppliedActionBuffer, seed=0)
-        model.learn(60)
-
-    def shield():
-        return safety_shield(gym.make(CRUISE))
-
-    learn(gym.wrappers.RescaleAction(shield(), np.float32(-3.0), np.float32(5.0)))  # stable-baselines3 scales, too
-    turned = gym.wrappers.TransformAction(shield(), lambda action: -0.5 * action, None)
-    with pytest.raises(ValueError, match="a wrapper outside the shield changes actions"):
-        learn(turned)

@@ -50,8 +50,6 @@ HYPERPARAMS = [
     ("PPO", {"gamma": 1.5}, r"gamma must be in \[0, 1\], got 1.5"),
     ("TD3", {"gamma": "high"}, r"gamma must be in \[0, 1\], got 'high'"),
     ("TD3", {"noise_std": -0.1}, "TD3: noise_std must be a number >= 0"),
-    ("SAC", {"stored_action": "both"}, "stored_action must be"),
-    ("TD3", {"stored_action": "applied", "n_steps": 3}, "stored step by step: n_steps must be 1"),
     ("PPO", {"policy_kwargs": {"activation_fn": print}}, "hyperparameters must be JSON values, got {'policy_kwargs': "),
     ("PPO", {"learning_rate": np.nan}, "hyperparameters must be JSON values, got {'learning_rate': nan"),
     ("DQN", {}, "unknown algorithm 'DQN'; known are PPO"),
