@@ -34,14 +34,7 @@ _DEPENDENCIES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnas
 
 @dataclass(frozen=True, eq=False)
 class Normalization:
-    """Normalizes observations: clip((o - mean) / sqrt(variance + epsilon), -clip, clip).
-
-    Attributes:
-        mean: Mean of the observations in training, shape (entries,).
-        variance: Their variance, shape (entries,).
-        epsilon: Keeps the root away from 0.
-        clip: Largest absolute value of a normalized entry.
-    """
+    """Normalizes observations: clip((o - mean) / sqrt(variance + epsilon), -clip, clip), by entry."""
 
     mean: np.ndarray
     variance: np.ndarray
@@ -50,11 +43,7 @@ class Normalization:
 
     @classmethod
     def of(cls, env: VecNormalize) -> Normalization:
-        """Returns the present statistics of a `VecNormalize`.
-
-        Raises:
-            TypeError: If its observations are dictionaries.
-        """
+        """Returns the present statistics; raises TypeError if observations are dictionaries."""
         statistics = env.obs_rms
         if isinstance(statistics, dict):
             raise TypeError("observations must be one array, got a dictionary of them")
@@ -78,8 +67,8 @@ class Agent:
         model: The stable-baselines3 model.
         normalization: Normalization of the model's observations.
         seed: Seed of the training.
-        shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
-        horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
+        shield_mode: Mode of the shield that the agent was trained behind.
+        horizon: Horizon of that shield in mode "lookahead" [steps].
         kwargs: Other keyword arguments of the environment that it was trained in, JSON values where it is to be saved.
     """
 
@@ -143,11 +132,7 @@ class Agent:
         return digest.hexdigest()
 
     def files(self) -> dict[str, bytes]:
-        """Returns the contents of `model.zip`, in stable-baselines3's format, and of `agent.json`, with the rest.
-
-        Raises:
-            ValueError: See `require_kept`.
-        """
+        """Returns the contents of `model.zip` and `agent.json`; raises ValueError as `require_kept` does."""
         require_kept(self.kwargs, self.env)
         buffer = io.BytesIO()
         self.model.save(buffer)

@@ -53,14 +53,7 @@ def normalized_env(name: str, env: VecEnv, hyperparams: Mapping[str, Any]) -> Ve
 
 
 def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: int, steps: int = 0) -> BaseAlgorithm:
-    """Returns an untrained model.
-
-    Args:
-        name: A name in `ALGORITHMS`.
-        env: The environment it will be trained in.
-        hyperparams: What `agents.hyperparams.complete_hyperparams` returns.
-        seed: Seed of the network's weights and of sampling.
-        steps: Number of steps it will be trained for, over which linear rates fall.
+    """Returns an untrained model with complete hyperparameters, whose linear rates fall over so many steps.
 
     Raises:
         ValueError: If there is no such hyperparameter, or stable-baselines3 does not take its value.

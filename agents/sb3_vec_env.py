@@ -85,11 +85,7 @@ class SB3VecEnv(VecEnv):
         super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Starts all episodes, with the seeds and options of `seed` and `set_options`, which are for these only.
-
-        Raises:
-            ValueError: If options differ between environments.
-        """
+        """Starts all episodes, with the seeds and options of `seed` and `set_options`, which have to be the same."""
         options = self._options[0]
         if not all(_same(option, options) for option in self._options):
             self._reset_options()

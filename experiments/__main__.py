@@ -15,22 +15,8 @@ a command, `ncs --version` prints the version. The commands:
 """
 _ERROR = 2
 _INTERRUPTED = 130
-# What each command does: the first sentence of its settings.
-COMMANDS = {
-    "compare": "Trains agents with and without the shield and compares violations, return and interventions.",
-    "train": "Trains one agent, evaluates it, and saves it with everything needed to use it.",
-    "evaluate": "Evaluates a trained agent, behind a shield or not, on any channel.",
-    "sweep": "Compares arms over a grid of channels: how safety, return and interventions depend on the channel.",
-    "render": "Draws an episode of a policy, as an animation or its last frame.",
-    "synthesize": "Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.",
-    "verify": "Verifies a certificate in exact arithmetic, says what it keeps, and writes its safety filter in C99 for "
-    "a board.",
-    "bounds": "Says what bounds of a plant's disturbances a record of it proves, and writes a plant with them.",
-    "channel": "Reads recorded packets, and says how often each channel contract would have been broken.",
-    "requirements": "Finds how old and how coarse the samples of a plant may be, so that it is certifiable.",
-    "attack": "Attacks shielded loops with worst-case disturbances and agents, and counts states outside.",
-    "paper": "Checks the claims of the paper (Liu et al.) from its own printed numbers, or simulates its Section 5.",
-}
+COMMANDS = ("compare", "train", "evaluate", "sweep", "render", "synthesize", "verify", "bounds", "channel")
+COMMANDS += ("requirements", "attack", "paper")
 # The extra that a command needs, and the packages of an extra.
 _EXTRAS = dict.fromkeys(("compare", "train", "evaluate", "sweep"), "train") | {"render": "render"}
 _PACKAGES = {
@@ -121,12 +107,19 @@ def _require_extra(extra: str) -> None:
 
 
 def _overview() -> str:
-    """Returns the commands with what they do, in lines of the terminal's width."""
+    """Returns the commands with the first sentence about their settings, read without importing what they need."""
+    import ast
+    from pathlib import Path
+
     from experiments.terminal import wrapped
 
-    indent = max(map(len, COMMANDS)) + 4
-    lines = [wrapped(does, label=f"  {name}", indent=indent) for name, does in COMMANDS.items()]
-    return "\n".join([_USAGE, *lines])
+    lines, indent = [_USAGE], max(map(len, COMMANDS)) + 4
+    for name in COMMANDS:
+        module = ast.parse((Path(__file__).parent / "commands" / f"{name}.py").read_text("utf-8"))
+        settings = next(node for node in module.body if isinstance(node, ast.ClassDef))
+        does = (ast.get_docstring(settings) or "").partition("\n\n")[0]
+        lines.append(wrapped(" ".join(does.split()), label=f"  {name}", indent=indent))
+    return "\n".join(lines)
 
 
 def _description(settings: type) -> str:

@@ -67,21 +67,15 @@ def say(line: str, indent: int = 2) -> None:
     tqdm.write(wrapped(line, indent=indent) if sys.stderr.isatty() else line, file=sys.stderr)
 
 
-def progress_bar(total: int, description: str, unit: str) -> tqdm:
-    """Returns a progress bar on stderr: a line that changes on a terminal, in a file a line of its own now and then.
-
-    Args:
-        total: Count at the end.
-        description: What goes on.
-        unit: What is counted.
-    """
+def progress_bar(steps: int, description: str) -> tqdm:
+    """Returns a progress bar on stderr: a line that changes on a terminal, in a file a line of its own now and then."""
     from tqdm import tqdm
 
     is_terminal = sys.stderr.isatty()
     return tqdm(
-        total=total,
+        total=steps,
         desc=description,
-        unit=f" {unit}",
+        unit=" step",
         unit_scale=True,
         bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_noinv_fmt}]",
         mininterval=_TERMINAL_PERIOD if is_terminal else _FILE_PERIOD,

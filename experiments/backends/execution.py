@@ -72,11 +72,7 @@ def file_name(run: TrainingRun) -> str:
 
 
 def save(folder: Path, run: TrainingRun, result: RunResult) -> None:
-    """Writes the result of a run into `runs/NAME.json`, and before it the agent's files into `models/NAME/`.
-
-    Raises:
-        OSError: If a file cannot be written.
-    """
+    """Writes the result of a run into `runs/NAME.json`, and before it the agent's files into `models/NAME/`."""
     path, models = folder / "runs" / file_name(run), folder / "models" / run.name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)  # an older result must not stand for the newer agent
@@ -120,7 +116,7 @@ def execute(
     """
     lost = []
     what = "training and evaluation" if any(run.trains for run in runs) else "evaluation"
-    with progress_bar(sum(run.total_steps for run in runs), what, "step") as bar, where as (submit, worker_died):
+    with progress_bar(sum(run.total_steps for run in runs), what) as bar, where as (submit, worker_died):
         numbers = {submit(number, run): number for number, run in enumerate(runs)}
         while numbers:
             finished, _ = wait(numbers, _PERIOD, FIRST_COMPLETED)

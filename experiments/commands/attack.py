@@ -75,7 +75,7 @@ def attack(settings: AttackSettings) -> None:
     cases = [(env_id, kind, channel) for env_id in envs for kind, channel in channels[env_id].items()]
     each = max(-(-settings.steps // (len(cases) * EPISODE_STEPS)), _FEWEST)
     rows, failed = {}, Counter[str]()
-    with progress_bar(len(cases) * each * EPISODE_STEPS, "attack", "step") as bar:
+    with progress_bar(len(cases) * each * EPISODE_STEPS, "attack") as bar:
         for number, (env_id, kind, channel) in enumerate(cases):
             env = envs[env_id]
             certificate = certificate_for(env.plant, env.certificate_contract, settings.safe_set)

@@ -67,11 +67,7 @@ class Arm:
 
     @classmethod
     def of(cls, name: str, mode: str = "project") -> Arm:
-        """Returns the arm of a name, whose spaces may be given as hyphens.
-
-        Raises:
-            ValueError: If the name is unknown.
-        """
+        """Returns the arm of a name, whose spaces may be given as hyphens; raises ValueError if it is unknown."""
         return _parsed(name, mode)
 
     @property

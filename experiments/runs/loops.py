@@ -27,12 +27,9 @@ _SHARE = 1e-3
 
 
 def registered_env(env_id: str) -> NCSEnv:
-    """Returns a registered environment that has a plant of its own.
+    """Returns a registered environment; raises ValueError if there is none of that id with a plant of its own.
 
     The id may be "module:id", which imports the module: only for ids that the user gave.
-
-    Raises:
-        ValueError: If the id is not registered or has no plant of its own, or there is no such module.
     """
     module, _, name = env_id.rpartition(":")
     if module:
@@ -54,11 +51,7 @@ def registered_env(env_id: str) -> NCSEnv:
 
 
 def import_module(module: str) -> None:
-    """Imports a module of the user's, which registers environments; it may lie in the working directory.
-
-    Raises:
-        ValueError: If there is no such module.
-    """
+    """Imports a module of the user's, also of the working directory; raises ValueError if there is none."""
     if not all(part.isidentifier() for part in module.split(".")):
         raise ValueError(f"--env module:id needs the name of a module, got {module!r}")
     folder = os.getcwd()
@@ -73,21 +66,13 @@ def import_module(module: str) -> None:
 
 
 class PlantInUse(NamedTuple):
-    """A plant, and what is known of the environment that it is in, if it is in one.
+    """A plant, and what is known of the environment that it is in, if it is in one."""
 
-    Attributes:
-        origin: Id of the environment, or the plant's file.
-        plant: The plant.
-        contract: Contract of the environment's certificates.
-        input_delay: Steps by which inputs are committed ahead.
-        asks: Whether samples are taken on request.
-    """
-
-    origin: str
+    origin: str  # id of the environment, or the plant's file
     plant: LinearPlant
-    contract: ChannelContract | None = None
-    input_delay: int = 0
-    asks: bool = False
+    contract: ChannelContract | None = None  # of the environment's certificates
+    input_delay: int = 0  # steps by which inputs are committed ahead
+    asks: bool = False  # whether samples are taken on request
 
 
 def plant_in_use(env_id: str, file: Path | None) -> PlantInUse:
@@ -100,15 +85,9 @@ def plant_in_use(env_id: str, file: Path | None) -> PlantInUse:
 
 
 def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs: Any) -> LoopConfig:
-    """Returns the bare control loop of a registered environment.
+    """Returns the bare control loop of a registered environment with changes of its channel and its keyword arguments.
 
-    Args:
-        env_id: As for `registered_env`.
-        channel: As for `with_channel`.
-        **kwargs: Keyword arguments of the environment; None keeps its own.
-
-    Raises:
-        ValueError: If the environment is unknown or has no plant of its own, or cannot have the channel.
+    None keeps the environment's own. For errors see `registered_env` and `changed_channel`.
     """
     registered_env(env_id)
     return with_channel(LoopConfig(env=id_alone(env_id), kwargs=kwargs), channel or {})
@@ -160,11 +139,7 @@ def other_scenarios(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def under(scenario: str, loop: LoopConfig) -> LoopConfig:
-    """Returns a control loop under a scenario.
-
-    Raises:
-        ValueError: If the scenario is unknown, or the channel cannot be worse within the contract.
-    """
+    """Returns a control loop under a scenario; raises ValueError if it is unknown or impossible there."""
     return loop if scenario == AS_TRAINED else _CHANGES[scenario_named(scenario)](loop)
 
 

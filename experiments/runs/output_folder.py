@@ -60,7 +60,7 @@ def _problem(folder: Path, content: dict[str, Any]) -> str:
 
 
 def write_json(path: Path | None, content: Any) -> None:
-    """Writes JSON values into a file if there is a path; raises OSError if it cannot be written."""
+    """Writes JSON values into a file if there is a path."""
     if path is not None:
         write_atomically(path, json.dumps(content, indent=1) + "\n")
 
@@ -71,11 +71,7 @@ def write_results(
     files: Mapping[str, str | bytes] = MappingProxyType({}),
     figures: Mapping[str, tuple[str, bytes]] = MappingProxyType({}),
 ) -> None:
-    """Writes what a command leaves; summary.json comes last, so that it stands for complete results.
-
-    Raises:
-        OSError: If a file cannot be written.
-    """
+    """Writes what a command leaves; summary.json comes last, so that it stands for complete results."""
     (folder / "figures").mkdir(exist_ok=True)
     for name, (_, png) in figures.items():
         write_atomically(folder / "figures" / f"{name}.png", png)

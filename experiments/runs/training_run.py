@@ -30,17 +30,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunResult:
-    """Result of a training run.
+    """Result of a training run, with the contents of the trained agent's files by name.
 
     Attributes:
-        arm: Name of the run's arm.
-        index: Number of the run within its arm.
-        train_steps: Training steps; 0 if nothing was trained.
-        train_violation_steps: Training steps whose true state violated the safe box.
-        train_interventions: Training steps in which the shield intervened.
         history: Running totals during the training.
         episodes: Evaluation episodes.
-        files: Contents of the trained agent's files by name.
         scenarios: Evaluation episodes under other scenarios by name.
     """
 
@@ -77,16 +71,12 @@ class TrainingRun:
     """Settings of one training run.
 
     Attributes:
-        arm: Name of its arm.
         policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; "pretrained" the one
             that comes with the package, in `agent_files`; the others are controllers (`experiments.baselines`).
         training_loop: Control loop that the policy is trained in, with its penalties.
         loop: Control loop that the policy is evaluated in.
         module: Module of the user's that registers the environment, imported where the run is executed.
-        seed: Seed of the experiment.
         index: Number of the run within its arm; runs with equal index are paired across arms.
-        steps: Training steps.
-        episodes: Evaluation episodes.
         certificate: Certificate of shield or filter, which also defines `times_safe_set` and the gain of controllers.
         scenarios: Further scenarios that the policy is evaluated under.
         algorithm: A name in `agents.hyperparams.ALGORITHMS`.
