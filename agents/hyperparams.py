@@ -82,10 +82,6 @@ def with_changes(hyperparams: Mapping[str, Any], changes: Mapping[str, Any]) -> 
 def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Returns the hyperparameters that an algorithm is trained with: those given, and the defaults.
 
-    Args:
-        algorithm: A name in `ALGORITHMS`.
-        given: Hyperparameters by name.
-
     Raises:
         ValueError: If the algorithm is unknown, what is given is no dictionary of JSON values, or `gamma` or a count
             such as `n_envs` is out of range.

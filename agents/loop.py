@@ -21,14 +21,7 @@ from shields.runtime.safety_filter import plan_horizon
 
 @dataclass(frozen=True)
 class ShieldSettings:
-    """Settings of the shield around an environment.
-
-    Attributes:
-        certificate: Certificate of the safe set; it is verified when the shield is built.
-        mode: Mode of `SafetyShield`: "project", "lookahead", "switch", "boundary" or "monitor".
-        penalty: Subtracted from the reward for every intervention.
-        horizon: Longest plan of mode "lookahead" [steps]; None becomes the shield's default there.
-        on_unproved: What the shield does where the state is not proved safe: "ignore", "warn" or "raise".
+    """Settings of a `SafetyShield`, which verifies the certificate when it is built.
 
     Raises:
         ValueError: If a value is none that a shield takes.
@@ -84,8 +77,8 @@ class LoopConfig:
         lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
 
     Raises:
-        ValueError: If the shield is something else, another filter is given beside a shield, the id is
-            not registered, a penalty is wrong, or `lagrangian` limits the cost of episodes without an end.
+        ValueError: If the shield is something else, a filter is given beside it, the id is not registered, a penalty is
+            wrong, or `lagrangian` limits the cost of episodes without an end.
     """
 
     env: str
@@ -151,10 +144,7 @@ class LoopConfig:
         return replace(self, shield=shield, filter=filtered, violation_penalty=0.0, lagrangian=None)
 
     def single(self, **settings: Any) -> gym.Env:
-        """Returns one environment, with the shield; penalties of violations and filter are for vectors.
-
-        `settings` are passed to `gym.make`.
-        """
+        """Returns one environment, with the shield; penalties of violations and filter are for vectors."""
         env = gym.make(self.env, **{**self.kwargs, **settings})
         return env if self.shield is None else SafetyShield(env, **vars(self.shield))
 

@@ -41,7 +41,7 @@ Inputs = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class RegulatorWeights:
-    """What a linear-quadratic regulator weighs against an error of the task of one width.
+    """What a regulator weighs against an error of the task of one width.
 
     Attributes:
         effort: An input at its limit; where the task prices changes of the input, a change by its limit.
@@ -86,11 +86,7 @@ class RegulatorProblem:
         return np.hstack([estimates, beyond.astype(np.float64)]) - z_s, z_s, u_s
 
     def gain(self) -> np.ndarray:
-        """Returns the gain of the optimal u = gain z, shape (m, entries).
-
-        Raises:
-            ValueError: If there is none.
-        """
+        """Returns the gain of the optimal u = gain z, shape (m, entries); raises ValueError if there is none."""
         if (gain := lqr_gain(self.A, self.B, self.E.T @ self.E, self.D.T @ self.D, self.E.T @ self.D)) is None:
             raise ValueError("there is no linear-quadratic regulator: the inputs cannot stabilize the plant")
         return gain

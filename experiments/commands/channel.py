@@ -84,14 +84,9 @@ def channel(settings: ChannelSettings) -> None:
         row = _row(found, contract.max_age)
         share = f", in {100.0 * row['broken']:.3g} % of steps" if row["times"] else ""
         newest = f"a newest sample of at most {counted(contract.max_age, 'step')}"
+        ahead = " (behind a downlink it also counts the steps by which inputs are committed ahead)"
+        newest += ahead * (settings.certificate is not None)
         print(wrapped(f"The {whose}'s contract, {newest}, was broken {how_often(row)}{share}."))
-        if settings.certificate:
-            print(
-                wrapped(
-                    "Behind a downlink the certificate's own also counts the steps by which inputs are committed "
-                    "ahead: see the row with so many less."
-                )
-            )
     elif certificate is not None:
         print(f"The {whose} needs no contract: it holds through any silence.")
     if len(asked) > 1:

@@ -37,16 +37,16 @@ def comparison_report(
         findings=findings,
         summary=summary,
         settings=settings,
-        shown_settings={name: _text(value) for name, value in flat(settings).items()},
+        shown_settings={name: _text(value) for name, value in _flat(settings).items()},
         verification=verification,
     )
 
 
-def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Returns JSON values by their dotted names, without the objects that hold others."""
     found: dict[str, Any] = {}
     for name, value in values.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return found
 
 

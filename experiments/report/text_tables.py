@@ -9,8 +9,6 @@ from typing import Any
 from experiments.runs.loops import AS_TRAINED
 from experiments.terminal import text_table, wrapped
 from ncs_gym.validation import counted
-from shields import Certificate, Report
-from shields.certificate_text import size_of
 
 _MOST_DECIMALS = 4
 # Arms and points whose proof did not hold that are listed.
@@ -123,10 +121,3 @@ def sweep_table(cells: list[dict[str, Any]]) -> str:
     more = f" and {counted(len(lost) - _MOST_LOST, 'other')}" if len(lost) > _MOST_LOST else ""
     text = f"The proof held in some evaluation episodes only: {'; '.join(lost[:_MOST_LOST])}{more}."
     return f"{table}\n\n{wrapped(text)}"
-
-
-def certificate_line(certificate: Certificate, verification: Report) -> str:
-    """Returns one line about a certificate and its exact verification."""
-    size = size_of(certificate)
-    conditions = f"certificate: {len(verification.conditions)} conditions hold in exact arithmetic"
-    return f"{conditions} ({size})" if size else conditions
