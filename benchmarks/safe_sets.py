@@ -24,7 +24,7 @@ from scipy.stats import qmc
 
 from benchmarks.commands import run, table
 from benchmarks.timing import least_times, timed
-from experiments.baselines import controller
+from experiments.baselines.controllers import controller
 from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
 from ncs_gym import LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env

@@ -17,7 +17,7 @@ from experiments.analysis.episodes import (
     training_table,
 )
 from experiments.backends.execution import results_of
-from experiments.baselines import why_aimless
+from experiments.baselines.controllers import why_aimless
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import decimals_of, summary_text

@@ -9,14 +9,9 @@ from functools import cache
 from agents.agent_file import AGENT_FILES, pretrained_folder
 from agents.hyperparams import ALGORITHMS, with_changes
 from agents.loop import LoopConfig, ShieldSettings
-from experiments.baselines import (
-    CONTROLLERS,
-    FILTERS,
-    REGULATORS,
-    EstimateFilterSettings,
-    tuned_training,
-    why_aimless,
-)
+from experiments.baselines.controllers import CONTROLLERS, REGULATORS, why_aimless
+from experiments.baselines.filters import FILTERS, EstimateFilterSettings
+from experiments.baselines.tuned import tuned_training
 from experiments.runs.loops import other_scenarios, registered_env, under
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.training_run import RunResult, TrainingRun, require_trainable

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from agents.agent_file import AgentError, pretrained_folder
-from experiments.baselines import REGULATORS, controller, tuned_weights
+from experiments.baselines.controllers import REGULATORS, controller
+from experiments.baselines.tuned import tuned_weights
 from experiments.terminal import say
 from ncs_gym import NCSEnv
 from shields.certificate import Fallback

@@ -15,7 +15,8 @@ from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
 from agents.results import Episode, TrainingPoint
-from experiments.baselines import controller, tuned_weights
+from experiments.baselines.controllers import controller
+from experiments.baselines.tuned import tuned_weights
 from experiments.runs.loops import AS_TRAINED, import_module, under
 from experiments.runs.provenance import module_digest, registration_of, versions
 from experiments.settings import LearningSettings

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from experiments.baselines import CONTROLLERS, RegulatorWeights, controller
-from experiments.baselines.controllers import equilibrium
+from experiments.baselines.controllers import CONTROLLERS, RegulatorWeights, controller, equilibrium
 from ncs_gym import Channel, Regulation, SetpointTracking, Task
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.model import zero_order_hold

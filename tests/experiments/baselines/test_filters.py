@@ -8,8 +8,8 @@ import pytest
 
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
-from experiments.baselines import FILTERS, EstimateFilterSettings, controller
-from experiments.baselines.filters import CertaintyEquivalentFilter, PredictiveFilter
+from experiments.baselines.controllers import controller
+from experiments.baselines.filters import FILTERS, CertaintyEquivalentFilter, EstimateFilterSettings, PredictiveFilter
 from ncs_gym.envs.env import ncs_env
 from tests.certificates import certificate_of
 from tests.plants import delayed

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from experiments.baselines import RegulatorWeights, controller
+from experiments.baselines.controllers import RegulatorWeights, controller
 from experiments.baselines.observer import DisturbanceObserver
 from experiments.runs.policies import policy_by_name
 from ncs_gym import Channel, SetpointTracking

@@ -5,7 +5,8 @@ import pytest
 from agents.hyperparams import DEFAULTS, with_changes
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from benchmarks.suite import NETWORK_TASKS
-from experiments.baselines import EstimateFilter, tuned_training
+from experiments.baselines.filters import EstimateFilter
+from experiments.baselines.tuned import tuned_training
 from experiments.commands.compare import CompareSettings
 from experiments.runs.arms import Arm, is_shield, run_of_arm
 from experiments.runs.loops import certificate_of

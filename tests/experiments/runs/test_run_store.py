@@ -5,7 +5,7 @@ import pytest
 
 from agents.loop import LagrangianSettings
 from experiments.backends.execution import load, results_of, save
-from experiments.baselines import EstimateFilterSettings
+from experiments.baselines.filters import EstimateFilterSettings
 from experiments.runs.provenance import versions
 from experiments.settings import BackendSettings
 from tests.experiments.results import training_run
