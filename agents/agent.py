@@ -159,11 +159,7 @@ class Agent:
         return {"model.zip": buffer.getvalue(), "agent.json": (json.dumps(content, indent=1) + "\n").encode()}
 
     def save(self, folder: str | Path, shield: ShieldSettings | None = None) -> None:
-        """Writes a folder that can be shared: `model.zip`, `agent.json`, and `certificate.json` of a shield.
-
-        Args:
-            folder: The folder, which is made if it does not exist; files of these names are replaced.
-            shield: The shield that the agent is meant to act behind, whose certificate is saved.
+        """Writes or replaces `model.zip`, `agent.json`, and `certificate.json` of a shield, in a folder to be shared.
 
         Raises:
             ValueError: If the certificate is for another plant than that of the agent's environment; see `files`.

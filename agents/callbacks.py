@@ -38,8 +38,7 @@ class SafetyCallback(BaseCallback):
 
     Attributes:
         history: Totals after every rollout; where rollouts are single steps, after every 200th part of the training.
-        violation_steps: Steps so far whose true state violated the safe box.
-        interventions: Steps so far in which the shield intervened.
+        violation_steps, interventions: As in `TrainingPoint`, so far.
     """
 
     def __init__(self, on_progress: Callable[[int], None] | None = None, priced: CostPenalty | None = None) -> None:
@@ -104,7 +103,7 @@ class DualAscentCallback(BaseCallback):
 
     Args:
         settings: Limit and learning rate.
-        priced: The environment's penalty, which is set.
+        priced: The penalty, which is set.
         episode_steps: See `LoopConfig.episode_steps`.
     """
 

@@ -79,7 +79,7 @@ def require_horizon(settings: Any, *modes: str | None) -> None:
 
 
 def short_version(settings: Any, **budget: Any) -> Any:
-    """Returns the settings of a command's short version if `--smoke` is given, otherwise the same settings."""
+    """Returns the settings of a command's short version if `--smoke` is given, else the same."""
     if not settings.smoke:
         return settings
     default = type(settings).out

@@ -40,9 +40,7 @@ def text_table(rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), lef
 
 
 def wrapped(text: str, *, label: str = "", indent: int = 2) -> str:
-    """Returns a text in lines of the terminal's width; only a longer word makes a line longer.
-
-    A number and its percent sign stay on one line.
+    """Returns a text in lines of the terminal's width; a longer word, or a number and its percent sign, stay whole.
 
     Args:
         text: The text, on one line.

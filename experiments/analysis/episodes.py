@@ -37,12 +37,7 @@ _COLUMNS = {
 
 
 def episodes_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
-    """Returns a row per evaluation episode; docs/experiments.md explains the columns.
-
-    Args:
-        results: Results of training runs.
-        **common: Columns with the same value in all rows: the environment, the algorithm, what a sweep varies.
-    """
+    """Returns a row per evaluation episode, with `common` values in all; docs/experiments.md has the columns."""
     rows = [
         common | _of_arm(result.arm) | {"run": result.index, "scenario": scenario} | _columns(episode)
         for result in results
@@ -102,7 +97,7 @@ def arm_summaries(results: Sequence[RunResult], mode: str) -> dict[str, dict[str
 def arm_summary(
     results: Sequence[RunResult], mode: str | None, *, fixed_policy: bool, filters_training: bool = True
 ) -> dict[str, Any]:
-    """Returns the summary of an arm, JSON values only.
+    """Returns the summary of an arm by the results of its runs and parts of its `Arm`, JSON values only.
 
     `eval_violation_rate_ci95` is the Clopper-Pearson interval of the probability that an episode violates, given the
     trained policies. `eval_violation_steps` and `eval_estimate_violation_steps` are plain counts, because the steps of
@@ -110,12 +105,6 @@ def arm_summary(
     single run), because training differs from run to run; for a policy that is the same in all runs (`fixed_policy`) it
     is over the episodes. The bootstrap intervals are over the same values. `plan_rate` is the share of steps that are
     executed from a stored plan (mode "lookahead"). `conditions` holds the same numbers for each other scenario.
-
-    Args:
-        results: Results of the arm's runs, in their order.
-        mode: Mode of its shield, or name of its other filter; None for neither.
-        fixed_policy: Whether the policy is the same in all runs.
-        filters_training: Whether the shield or filter acts in training, too.
     """
     steps = sum(result.train_steps for result in results)
     violations = [result.train_violation_steps for result in results]

@@ -106,7 +106,7 @@ def execute(
     where: AbstractContextManager[Engine],
     keep: Callable[[TrainingRun, RunResult], object],
 ) -> None:
-    """Executes runs, and hands each result to `keep` when it is there; for errors see `results_of`.
+    """Executes runs and hands each result to `keep` when it is there; for errors see `results_of`.
 
     Args:
         runs: The runs.

@@ -159,7 +159,7 @@ def _tracking_problem(plant: LinearPlant, task: SetpointTracking, weights: Regul
 
 
 def regulator(env: NCSEnv, weights: RegulatorWeights) -> Inputs:
-    """Returns the linear-quadratic regulator of the task's error, with what is known of its targets."""
+    """Returns the linear-quadratic regulator of the task's error."""
     problem = regulator_problem(env, weights)
     gain = problem.gain()
 

@@ -79,8 +79,7 @@ class PredictiveFilter:
         certificate: Gives S and K; verified exactly here.
         plant: The plant it was made for.
         horizon: N [steps], at least 2.
-        margin: Fraction of half the range of the box, and of the way from the resting point to a face of the safe set,
-            that is kept free.
+        margin: Fraction that is kept free of half the range of the box and of the way to a face of the safe set.
         tube: Whether the tightenings are those of the tube, beside the margin.
 
     Raises:
@@ -200,7 +199,6 @@ class PredictiveFilter:
 
 
 def _middle_and_half(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns middles and halves of ranges, of which one end may be open."""
     low, high = closed(low, high)
     return 0.5 * (low + high), 0.5 * (high - low)
 
@@ -208,10 +206,7 @@ def _middle_and_half(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.
 def _tube(
     certificate: Certificate, plant: LinearPlant, end_sizes: Callable[[np.ndarray], np.ndarray], horizon: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how far true states are off a plan in the rows of the box, (horizon + 1, k), and in the set at its end.
-
-    `end_sizes` returns how far the states of an ellipsoid of a given shape reach at the end.
-    """
+    """Returns how far true states are off a plan in the rows of the box, (horizon + 1, k), and at its end."""
     K, rows = certificate.K, plant.box
     first = list(certificate.error_shapes)
     pushes = [plant.B @ K @ shape @ (plant.B @ K).T for shape in first]
@@ -262,18 +257,14 @@ class EstimateFilter(VectorWrapper):
         self._begins_at_once = inner.autoreset_mode is AutoresetMode.SAME_STEP
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts episodes; see `NCSVectorEnv.reset`."""
+        """Starts episodes."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._estimates, self._begun = info["estimate"].copy(), info["episode_steps"] == 0
         nothing = np.zeros((self.num_envs, self._plant.m))
         return observation, info | _info(nothing, nothing, np.zeros(self.num_envs, np.bool_))
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Steps the environments with the filtered actions.
-
-        Raises:
-            ValueError: If an action is not finite or the shape is wrong.
-        """
+        """Steps the environments with the filtered actions."""
         proposed = self._inputs_of(actions).T.copy()
         applied = self._rule(self._estimates, proposed, self._begun)
         intervened = (applied != proposed).any(axis=1)

@@ -78,13 +78,7 @@ class Arm:
     def loops(
         self, loop: LoopConfig, certificate: Certificate, settings: LearningSettings
     ) -> tuple[LoopConfig, LoopConfig]:
-        """Returns the control loop that the arm's policies are trained in, and the one that they are evaluated in.
-
-        Args:
-            loop: The bare control loop.
-            certificate: Certificate of the shield or filter.
-            settings: Horizon and penalties.
-        """
+        """Returns the control loops that the arm's policies are trained and evaluated in, given the bare one."""
 
         def filtered(penalty: float = 0.0) -> LoopConfig:
             if self.mode is None:
