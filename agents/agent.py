@@ -111,18 +111,6 @@ class Agent:
         actions = self.model.predict(self.normalization(batch), deterministic=True)[0]
         return actions[0] if len(shape) == 1 else actions
 
-    def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[np.ndarray, None]:
-        """Returns actions as `act` does, and no state: what code for models of stable-baselines3 calls.
-
-        Raises:
-            ValueError: As `act` does, or if actions are to be drawn.
-        """
-        if not deterministic:
-            raise ValueError("agents act deterministically: agent.model.predict draws, from normalized observations")
-        return self.act(observation), None
-
     @cached_property
     def checksum(self) -> str:
         """SHA-256 of the weights."""
