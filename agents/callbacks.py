@@ -27,9 +27,7 @@ class SafetyCallback(BaseCallback):
     `safety/intervention_rate`, and with a shield `safety/mean_correction` (norm of applied minus proposed input) and
     `safety/guaranteed_rate` (steps after which the state is proved safe).
 
-    A training step is counted once. Behind action repeat, which takes several control steps in one, infos are those of
-    the last: `episode_violations` and `episode_interventions` count all.
-
+    A training step is counted once; behind action repeat `episode_violations` and `episode_interventions` count all.
     Totals begin anew where the model counts its steps anew (`learn` with `reset_num_timesteps`).
 
     Args:

@@ -42,12 +42,7 @@ class SB3VecEnv(VecEnv):
     `is_success` and `episode_guaranteed` where there are such infos. Besides, the dict of an environment has those of
     its infos that `info_keywords` names, at every step; `batch_info` has all infos as arrays.
 
-    Importing this class sets torch to one thread, with which small networks train fastest; call
-    `torch.set_num_threads` after the import for another number.
-
-    Args:
-        vector_env: The vector environment.
-        info_keywords: Infos that stand in the dict of every step, for buffers and callbacks that read them.
+    Importing this class sets torch to one thread; call `torch.set_num_threads` after the import for another number.
 
     Attributes:
         batch_info: Infos of the last step, arrays with the environment as first axis; for an environment whose episode

@@ -52,8 +52,6 @@ def train(
 ) -> TrainingResult:
     """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
 
-    torch has one thread once `agents.SB3VecEnv` is imported; `torch.set_num_threads` changes both that and results.
-
     Args:
         loop: The control loop.
         steps: Environment steps to train for, rounded up to whole rollouts.
@@ -65,9 +63,8 @@ def train(
         log_folder: Folder for TensorBoard's events.
         on_progress: Called with the number of steps taken since its last call; an exception ends the training.
         callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
-        start: An agent to go on from, of the same environment, algorithm and networks: its weights, the state of its
-            optimizers and its normalization; replay buffers begin anew, with random actions for `learning_starts` steps
-            that count. Give another seed: with the same one it meets the same starts and packet losses once more.
+        start: An agent to go on from, of the same environment, algorithm and networks: its weights, optimizers and
+            normalization. Give another seed: with the same one it meets the same starts and packet losses once more.
 
     Warns:
         UserWarning: If files of agents do not keep a keyword argument of the environment.

@@ -41,17 +41,11 @@ Inputs = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class RegulatorWeights:
-    """What a regulator weighs against an error of the task of one width.
+    """What a regulator weighs against an error of the task of one width."""
 
-    Attributes:
-        effort: An input at its limit; where the task prices changes of the input, a change by its limit.
-        state: A state at the edge of the box.
-        disturbance: alpha of `DisturbanceObserver`, for regulators with one.
-    """
-
-    effort: float = 0.01
-    state: float = 0.01
-    disturbance: float = 0.2
+    effort: float = 0.01  # an input at its limit; where the task prices changes of the input, a change by its limit
+    state: float = 0.01  # a state at the edge of the box
+    disturbance: float = 0.2  # alpha of `DisturbanceObserver`
 
 
 DEFAULT_WEIGHTS = RegulatorWeights()
@@ -62,20 +56,13 @@ class RegulatorProblem:
     """The sum of |E z + D u|^2 along z+ = A z + B u, where z is the state and what else of the observation counts.
 
     Under a disturbance d that stays, z and u count from (z_s, u_s) = rest d, where the tracked output is 0.
-
-    Attributes:
-        A: Shape (entries, entries).
-        B: Shape (entries, m).
-        E: Shape (costs, entries).
-        D: Shape (costs, m).
-        rest: Shape (entries + m, n).
     """
 
-    A: np.ndarray
-    B: np.ndarray
-    E: np.ndarray
-    D: np.ndarray
-    rest: np.ndarray
+    A: np.ndarray  # (entries, entries)
+    B: np.ndarray  # (entries, m)
+    E: np.ndarray  # (costs, entries)
+    D: np.ndarray  # (costs, m)
+    rest: np.ndarray  # (entries + m, n)
 
     def shifted(
         self, observations: np.ndarray, estimates: np.ndarray, disturbances: np.ndarray
@@ -304,14 +291,7 @@ def why_aimless(name: str, task: Task) -> str:
 def controller(
     name: str, env: NCSEnv, fallback: Fallback, seed: int, weights: RegulatorWeights = DEFAULT_WEIGHTS
 ) -> Policy:
-    """Returns a policy in `CONTROLLERS` or `REGULATORS` for vector environments.
-
-    Args:
-        name: Its name.
-        env: A single environment with the plant and the task.
-        fallback: What "K x_hat" applies.
-        seed: Seed of the random policy.
-        weights: Weights of the regulators.
+    """Returns a policy in `CONTROLLERS` or `REGULATORS` for vector environments like a single one.
 
     Raises:
         ValueError: If a regulator does not know what the task asks for.

@@ -33,11 +33,8 @@ Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 class CertaintyEquivalentFilter:
     """Decides as the shield does, with Sigma_k = 0 in the place of the true error ellipsoid, and so without a proof.
 
-    Args:
-        certificate: Verified exactly here.
-        plant: The plant it was made for.
-        margin: Fraction of the safe set that is kept free after the next step: margin^2 L in the place of A Sigma_k A',
-            where states can be off at all (past inputs are known).
+    The margin is the fraction of the safe set that is kept free after the next step: margin^2 L in the place of
+    A Sigma_k A', where states can be off at all (past inputs are known).
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -77,7 +74,7 @@ class PredictiveFilter:
 
     Args:
         certificate: Gives S and K; verified exactly here.
-        plant: The plant it was made for.
+        plant: Its plant.
         horizon: N [steps], at least 2.
         margin: Fraction that is kept free of half the range of the box and of the way to a face of the safe set.
         tube: Whether the tightenings are those of the tube, beside the margin.

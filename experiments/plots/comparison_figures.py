@@ -145,10 +145,7 @@ def training_figure(arms: ResultsByArm, styles: Mapping[str, ArmStyle]) -> Capti
 
 
 def _histories(results: Sequence[RunResult]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns steps (points,), and returns, violating steps and interventions so far (runs, points) of an arm.
-
-    The runs of an arm note their totals at the same steps; of one that noted fewer only those are left.
-    """
+    """Returns steps (points,), and returns, violating steps and interventions so far (runs, points) of an arm."""
     points = min(len(result.history) for result in results)
     names = ("steps", "episode_return", "violation_steps", "interventions")
     steps, *others = (

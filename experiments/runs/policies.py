@@ -30,10 +30,7 @@ Policy = Callable[[np.ndarray, dict], np.ndarray]
 
 
 def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
-    """Returns a policy for an environment of an id.
-
-    It is that of an untrained controller, whose spaces may be given as hyphens, of the "pretrained" agent, or of an
-    agent in a folder, which may be that of the run that left it.
+    """Returns an untrained controller, whose spaces may be given as hyphens, or what an agent of `agent_named` does.
 
     Raises:
         AgentError: If there is no agent for this environment.
