@@ -69,22 +69,3 @@ def test_runs_of_one_name_are_refused(run, tmp_path):
     for runs in ((run, run), alike):
         with pytest.raises(ValueError, match="same name"):
             results_of(runs, tmp_path, BackendSettings(jobs=1))
-
-
-def test_finished_runs_are_not_run_again(folder, run, result, tmp_path, monkeypatch, capsys):
-    ran = []
-
-    def record(runs, counts, where, keep):
-        for each in runs:
-            ran.append(each.name)
-            keep(each, replace(result, index=2))
-
-    monkeypatch.setattr("experiments.backends.execution.execute", record)
-    missing = replace(run, index=2)
-    results = results_of([run, missing], tmp_path, BackendSettings(jobs=1))
-    assert ran == [missing.name]
-    assert [one.index for one in results] == [1, 2]
-    assert [one.files for one in results] == [result.files] * 2
-    assert "1 of 2 runs were finished before" in capsys.readouterr().err
-    results_of([missing, run], tmp_path, BackendSettings(jobs=1))
-    assert ran == [missing.name]
