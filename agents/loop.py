@@ -72,6 +72,7 @@ class LoopConfig:
         shield: Settings of the shield; None applies the agent's actions as they are.
         filter: Puts another safety filter around vector environments, in place of a shield. Evaluations leave out the
             `penalty` of a dataclass, and keep what any other function subtracts from rewards.
+        observed: Puts what an agent sees in place of the observations of vector environments around them.
         violation_penalty: Subtracted from the reward of every step whose true state violates the safe box, in vector
             environments, which agents are trained in.
         lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
@@ -85,6 +86,7 @@ class LoopConfig:
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     shield: ShieldSettings | None = None
     filter: Callable[[VectorEnv], VectorEnv] | None = None
+    observed: Callable[[VectorEnv], VectorEnv] | None = None
     violation_penalty: float = 0.0
     lagrangian: LagrangianSettings | None = None
 
@@ -158,6 +160,8 @@ class LoopConfig:
                 envs = VectorSafetyShield(envs, **vars(self.shield))
         if self.filter is not None:
             envs = self.filter(envs)
+        if self.observed is not None:
+            envs = self.observed(envs)
         if self.lagrangian is not None:
             return CostPenalty(envs, self.lagrangian.multiplier)
         return CostPenalty(envs, self.violation_penalty) if self.violation_penalty else envs

@@ -31,7 +31,7 @@ from agents.evaluation import Policy
 from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
 from agents.loop import LagrangianSettings
 from benchmarks.commands import run, some_of
-from benchmarks.suite import ENTRIES, REGULATED, TASKS, rows_of
+from benchmarks.suite import ENTRIES, REGULATED, TASKS, observing, rows_of
 from benchmarks.timing import timed
 from experiments.baselines.controllers import OBSERVER, RegulatorWeights, controller
 from experiments.commands.compare import CompareSettings
@@ -45,7 +45,7 @@ ROOT = Path(__file__).resolve().parent.parent
 SEARCH_SEED, PACKAGE_SEED = 1_000_000, 3_000_000
 EPISODES = 200
 # Arms of the benchmark that are tuned, each once; other cost limits go with what was tuned for the first one.
-TUNED = tuple(dict.fromkeys(entry.arm for entry in ENTRIES.values() if not entry.arm.startswith("lagrangian:")))
+TUNED = tuple(dict.fromkeys(each.tuned_as for each in ENTRIES.values() if not each.arm.startswith("lagrangian:")))
 # Steps of a training; where more were seen to help, four times as many.
 STEPS, MORE_STEPS = 150_000, 600_000
 LONGER = ("ncs_gym/CartPole-v0", "ncs_gym/CartPoleTwoWay-v0", "ncs_gym/CartPoleNonlinear-v0")
@@ -260,7 +260,7 @@ def tune_arms(
     results = Results(out)
     chosen: dict[str, dict[str, dict[str, Any]]] = json.loads(TUNED_ARMS.read_text("utf-8"))
     for task in tasks:
-        loop, needed = LoopConfig(env=f"ncs_gym/{task}"), {ENTRIES[name].arm for name in rows_of(task)}
+        loop, needed = LoopConfig(env=f"ncs_gym/{task}"), {ENTRIES[name].tuned_as for name in rows_of(task)}
         single = ncs_env(loop.single())
         certificate = certificate_for(single.plant, single.certificate_contract)
 
@@ -306,7 +306,9 @@ def _trained_arm(loop: LoopConfig, arm: str, certificate: Certificate, tried: di
     own = {name: value for name, value in tried.items() if name != "hyperparams"}
     if "lagrangian" in own:
         own["lagrangian"] = LagrangianSettings(**own["lagrangian"])
-    training, evaluated = Arm.of(arm).loops(loop, certificate, replace(CompareSettings(), **own))
+    arm, _, seen = arm.partition(", ")
+    loops = Arm.of(arm).loops(loop, certificate, replace(CompareSettings(), **own))
+    training, evaluated = (observing(seen, each) for each in loops)
     hyperparams = with_changes(DEFAULTS["PPO"], tried.get("hyperparams", {}))
     return mean_return(evaluated, trained(training, hyperparams, TRAINING_STEPS, SEARCH_SEED), SEARCH_SEED, episodes)
 

@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from matplotlib.artist import Artist
 from matplotlib.ticker import NullLocator
+from scipy.stats import chi2
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -278,10 +279,26 @@ MARKS = {"Wi-Fi": ("#0072b2", "o"), "rural": ("#d55e00", "s"), "burst": ("#009e7
 
 
 class Measured(NamedTuple):
-    """How often the box is left per hour, and at which share of the steps the guarantee holds."""
+    """How often the box is left in so many hours, and at which share of the steps the guarantee holds."""
 
-    left: float
+    ends: int
+    hours: float
     ever: float
+
+    @property
+    def left(self) -> float:
+        """Ends per hour."""
+        return self.ends / self.hours
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Where the rate of ends per hour lies with 95 %, as of a Poisson process."""
+        low = 0.5 * chi2.ppf(0.025, 2 * self.ends) if self.ends else 0.0
+        return float(low) / self.hours, 0.5 * float(chi2.ppf(0.975, 2 * self.ends + 2)) / self.hours
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.left:.0f} [{low:.0f}, {high:.0f}]"
 
 
 def behind(env: VectorEnv, name: str) -> VectorEnv:
@@ -330,7 +347,7 @@ def measured(env_id: str, network: str, name: str, count: int, hours: float) -> 
         ended += np.count_nonzero(terminated)
         ever += np.count_nonzero(info.get("shield_guaranteed", False))
     number = steps * count
-    return Measured(ended / (number * dt / 3600.0), ever / number)
+    return Measured(ended, number * dt / 3600.0, ever / number)
 
 
 def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> CaptionedFigure:
@@ -353,6 +370,7 @@ def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> Captioned
             for offset, (network, each) in zip((-0.22, 0.0, 0.22), networks.items(), strict=True):
                 color, marker = MARKS[network]
                 given = {"color": color, "marker": marker, "linestyle": "", "markersize": 4.5, "clip_on": False}
+                left.plot(each.interval, (row + offset, row + offset), color=color, lw=1.0)
                 handles[network] = left.plot(each.left, row + offset, **given)[0]
                 if name in CLAIMING:
                     claimed.plot(100.0 * each.ever, row + offset, **given)
@@ -377,23 +395,24 @@ def recorded(
     the contracts.
 
     The agent pushes in one direction for half a second to two, then in another; "mpc" and "mpc:20" are model predictive
-    control of the task instead, without a margin and with one of a fifth. Disturbances are adversarial. An episode ends
-    where the box is left, or after a minute. "left" counts these ends per hour of plant time, "ever" is the share
-    of steps at which the guarantee holds. A dash stands for a filter that claims nothing. With --out a figure of it.
+    control of the task instead, without a margin and with one of a fifth. Disturbances are adversarial. An episode
+    ends where the box is left, or after a minute. "left" counts these ends per hour of plant time, with the
+    interval of a Poisson process, "ever" is the share of steps at which the guarantee holds. A dash stands for a
+    filter that claims nothing. With --out a figure of it.
     """
     shares_of = "  " + "".join(f"{each:>6}" for each in NETWORKS)
     found: dict[str, dict[str, dict[str, Measured]]] = {}
     for name in ids:
-        print(f"{name:16}{'left per hour':>24}  {'ever [%]':>18}")
-        print(f"{'':16}" + "".join(f"{each:>8}" for each in NETWORKS) + shares_of)
+        print(f"{name:14}{'left per hour [95 %]':>57}  {'ever [%]':>18}")
+        print(f"{'':14}" + "".join(f"{each:>19}" for each in NETWORKS) + shares_of)
         of_env = found[name] = {}
         for each in filters:
             over = of_env[each] = {
                 network: measured(f"ncs_gym/{name}-v0", network, each, envs, hours) for network in NETWORKS
             }
-            text = "".join(f"{one.left:8.1f}" for one in over.values())
+            text = "".join(f"{one!s:>19}" for one in over.values())
             shares = [f"{100.0 * one.ever:6.1f}" if each in CLAIMING else f"{'-':>6}" for one in over.values()]
-            print(f"{each:16}{text}  {''.join(shares)}", flush=True)
+            print(f"{each:14}{text}  {''.join(shares)}", flush=True)
         print()
     if out is not None:
         out.write_bytes(_claims_drawn(found).png)

@@ -36,6 +36,8 @@ from shields.synthesis.invariant_polytope import points_of_box
 _POINTS_LOG2, _STEPS = 9, 60
 # After so many samples errors that are hidden in noise are sought.
 _CYCLES = (1, 2, 4, 8, 16, 32)
+# A constant disturbance that nothing balances is sought by so many linear programs from every state.
+_TURNS = 4
 _SIDES = {"low": -np.inf, "high": np.inf}
 # Plants whose filters are attacked in C: limits of two ends, free states, unstable ones, outputs and registers.
 _ON_BOARDS = (
@@ -167,19 +169,26 @@ def impossible(names: Names = ("ctms_suspension", "double_integrator", "tvc_rock
 def impossible_beyond(plant: LinearPlant, first: np.ndarray, period: int) -> Fraction | float:
     """Returns a multiple of all bounds beyond which no controller keeps the box of a plant; infinite if none is found.
 
-    A sample comes every `period` steps. Let errors e follow from a first one and from disturbances, hidden in the noise
-    by each sample, |H e| <= v. Then they and their opposites give the same outputs, hence the same inputs, and states
-    that differ by 2 e just before the next sample: in one of the two cases a row c of a range below 2 c e is left.
-    Linear programs find large c e. What these are, and what part of the bounds they take, is computed without rounding.
+    Linear programs find what defeats every controller. What part of the bounds it takes is computed without rounding.
 
     Args:
         plant: The plant, disturbed by a box through a matrix, with sensor noise in a box.
         first: Half-widths of the first error, shape (n,).
         period: The contract's largest age and one more [steps].
     """
+    return min(_hidden_beyond(plant, first, period), _unbalanced_beyond(plant))
+
+
+def _hidden_beyond(plant: LinearPlant, first: np.ndarray, period: int) -> Fraction | float:
+    """Returns the multiple beyond which what no sample shows leaves the box.
+
+    A sample comes every `period` steps. Let errors e follow from a first one and from disturbances, hidden in the noise
+    by each sample, |H e| <= v. Then they and their opposites give the same outputs, hence the same inputs, and states
+    that differ by 2 e just before the next sample: in one of the two cases a row c of a range below 2 c e is left.
+    """
     disturbance, sensor = plant.bounds.disturbance.parts[0], plant.bounds.sensor.parts[0]
     values = plant.A, plant.H, np.diag(first), disturbance.E, np.diag(disturbance.set.half), sensor.half
-    exact_values = [np.vectorize(Fraction, otypes=[object])(each) for each in values]
+    exact_values = [_exact(each) for each in values]
     least = np.inf
     for steps in (period * cycles for cycles in _CYCLES):
         units = np.eye(plant.n + steps * disturbance.E.shape[1])  # of the first error, then of every disturbance
@@ -187,12 +196,76 @@ def impossible_beyond(plant: LinearPlant, first: np.ndarray, period: int) -> Fra
         for row, low, high in zip(plant.box, *plant.box_ends, strict=True):
             found = linprog(-row @ error, np.vstack([hidden, -hidden]), np.ones(2 * len(hidden)), bounds=(-1.0, 1.0))
             if np.isfinite(high - low) and found.status == 0 and found.fun < 0.0:
-                numbers = np.vectorize(Fraction, otypes=[object])(found.x)
+                numbers = _exact(found.x)
                 reached, shown = _errors(exact_values, numbers, period)
                 taken = max(map(abs, [*numbers, *shown]))
                 reach = sum(Fraction(c) * e for c, e in zip(row, reached, strict=True))
                 least = min(least, (Fraction(high) - Fraction(low)) * taken / (2 * reach))
     return least
+
+
+def _unbalanced_beyond(plant: LinearPlant) -> Fraction | float:
+    """Returns the multiple beyond which a constant disturbance drives the state out of the box, even if all is known.
+
+    For a row y let y (A - I) x + y B u >= -r for all states and inputs within their limits, and let the bounds allow a
+    d with y d = s. While limits are kept under k d, y x grows by at least k s - r in every step, and leaves its range
+    if k > r / s. Linear programs find the largest multiple of a d that an equilibrium balances, and y as multipliers;
+    the next d is the one of the largest y d.
+    """
+    n, disturbance = plant.n, plant.bounds.disturbance.parts[0]
+    ends = np.concatenate([_intervals(plant), _exact(plant.input_ends)], axis=1)
+    moved = np.concatenate([_exact(plant.A) - _exact(np.eye(n)), _exact(plant.B)], axis=1)
+    pushed = _exact(disturbance.E) * _exact(disturbance.set.half)
+    units = np.concatenate([plant.half_widths, plant.input_half])
+    balance, limits = moved.astype(float) * units / units[:n, None], ends.astype(float) / units
+    push, least = pushed.astype(float) / units[:n, None], np.inf
+    for y in np.eye(n):
+        for _ in range(_TURNS):
+            constant = push @ np.sign(y @ push)
+            found = linprog(
+                np.append(np.zeros(len(units)), -1.0),
+                A_eq=np.column_stack([balance, constant]),
+                b_eq=np.zeros(n),
+                bounds=[*limits.T, (0.0, None)],
+            )
+            if found.status != 0 or not found.eqlin.marginals.any():  # nothing limits what is balanced
+                break
+            y = found.eqlin.marginals
+            least = min(least, *(_balanced(_exact(row / units[:n]), moved, pushed, ends) for row in (y, -y)))
+    return least
+
+
+def _balanced(y: np.ndarray, moved: np.ndarray, pushed: np.ndarray, ends: np.ndarray) -> Fraction | float:
+    """Returns r / s of a row y, shape (n,), without rounding; infinite if y x or r has no end.
+
+    Args:
+        y: The row.
+        moved: (A - I, B), shape (n, n + m).
+        pushed: What the disturbance's numbers push at the end of their bounds, shape (n, k).
+        ends: Of states and inputs, shape (2, n + m).
+    """
+    highest, r = (
+        sum(max(c * e for e in two) for c, two in zip(row, ends.T[: len(row)], strict=True) if c)
+        for row in (y, -(y @ moved))
+    )
+    s = sum(map(abs, y @ pushed))
+    return r / s if s and highest < np.inf and r < np.inf else np.inf
+
+
+def _intervals(plant: LinearPlant) -> np.ndarray:
+    """Returns the ends that rows of the box with one entry set to each state, exact or infinite, shape (2, n)."""
+    ends = np.array([[-np.inf], [np.inf]], dtype=object).repeat(plant.n, axis=1)
+    for row, two in zip(plant.box, plant.box_ends.T, strict=True):
+        states = np.flatnonzero(row)
+        if len(states) == 1:
+            size = Fraction(row[states[0]])
+            low, high = sorted(each * float(size) if np.isinf(each) else Fraction(each) / size for each in two)
+            ends[:, states[0]] = max(ends[0, states[0]], low), min(ends[1, states[0]], high)
+    return ends
+
+
+def _exact(numbers: np.ndarray) -> np.ndarray:
+    return np.vectorize(Fraction, otypes=[object])(numbers)
 
 
 def _errors(values: Any, numbers: np.ndarray, period: int) -> tuple[np.ndarray, np.ndarray]:
@@ -239,8 +312,8 @@ def _attacked_board(
     """Returns guaranteed steps, how many were outside, and how far the state got, 1 at the boundary of the set."""
     rng, polytope, (n, m, _, h, _) = np.random.default_rng(0), certificate.polytope, table.sizes.values()
     assert polytope is not None
-    memory = ctypes.create_string_buffer(8 * (2 * n + (h + 1) * m) + 64)
-    reason = np.frombuffer(memory, np.int32)[2 * (2 * n + (h + 1) * m) + 5 :]  # after five counters
+    memory = np.zeros(2 * (2 * n + (h + 1) * m) + 16, np.int32)
+    reason, (low, high) = memory[2 * (2 * n + (h + 1) * m) + 5 :], plant.input_ends  # after five counters
     u, guaranteed, outside, farthest, oldest, mixes = np.zeros(m), 0, 0, 0.0, 0, False
     noises = plant.nominal_disturbance, plant.nominal_sensor_error
 
@@ -250,7 +323,7 @@ def _attacked_board(
     for episode in range(steps // _EPISODE):
         x = rng.standard_normal(n) * plant.half_widths
         x = polytope.center + rng.uniform(0.5, 0.999) / polytope.gauge(polytope.center + x) * x
-        assert c.ncs_start(memory, episode, at(x + plant.nominal_initial_error.sample_boundary(rng)))
+        assert c.ncs_start(at(memory), episode, at(x + plant.nominal_initial_error.sample_boundary(rng)))
         taken: list[np.ndarray] = []
         for step in range(_EPISODE):
             if step % _PATIENCE == 0:
@@ -260,10 +333,10 @@ def _attacked_board(
             taken.append(plant.H @ x + v)
             ages = [h, oldest, *rng.integers(h + 1, size=2 * mixes).tolist()]
             for age in sorted((each for each in ages if step - each >= 1), reverse=True):
-                c.ncs_receive(memory, episode, step - age, at(taken[step - age]))
-            outwards = np.where(plant.B.T @ f > 0.0, plant.input_high, plant.input_low)
-            proposed = rng.choice([outwards, rng.uniform(1.5 * plant.input_low, 1.5 * plant.input_high), np.nan * u])
-            c.ncs_decide(memory, at(proposed), at(u))
+                c.ncs_receive(at(memory), episode, step - age, at(taken[step - age]))
+            outwards = np.where(plant.B.T @ f > 0.0, high, low)
+            proposed = rng.choice([outwards, rng.uniform(1.5 * low, 1.5 * high), np.nan * u])
+            c.ncs_decide(at(memory), at(proposed), at(u))
             if reason[0] == GUARANTEED:
                 guaranteed, farthest = guaranteed + 1, max(farthest, float(polytope.gauge(x)))
                 outside += int(polytope.gauge(x) > 1.0 + 1e-9 or plant.constraint_values(x).max() > 1e-9)

@@ -18,12 +18,15 @@ from scipy.stats import sem, t
 
 from agents.agent_file import AGENT_FILES
 from agents.evaluation import Policy, evaluate
+from agents.hyperparams import with_changes
 from agents.loop import LoopConfig
 from benchmarks.commands import run, some_of
 from benchmarks.suite_figures import suite_figures
+from benchmarks.suite_observations import Remembered, Shown
 from experiments.analysis.episodes import episodes_table, training_table
 from experiments.analysis.statistics import CONFIDENCE, clopper_pearson
 from experiments.backends.execution import results_of
+from experiments.baselines.tuned import tuned_training
 from experiments.commands.compare import CompareSettings
 from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import AS_TRAINED, certificate_of, loop_config, registered_env, under
@@ -55,6 +58,8 @@ class Entry:
         arm: Arm of `ncs compare` by which agents are trained, or that needs no training.
         tested: Arm behind whose filter they are judged; empty for the same.
         attacked: Whether they are trained under the attack.
+        observed: What agents see besides: "disturbance", the estimated one, or "memory"; empty for nothing.
+        safe_set: What the shield keeps, "ellipsoid"; empty for the polytope of the others.
         everywhere: Whether the row is that of all tasks, not only of those in which the network decides.
         seeds: Runs of a block; None for as many as asked for.
     """
@@ -62,8 +67,15 @@ class Entry:
     arm: str
     tested: str = ""
     attacked: bool = False
+    observed: str = ""
+    safe_set: str = ""
     everywhere: bool = False
     seeds: int | None = None
+
+    @property
+    def tuned_as(self) -> str:
+        """Name under which is kept what was tuned for its agents or regulator."""
+        return f"{self.arm}, {self.observed}" if self.observed else self.arm
 
 
 # Rows of the table by name. The first ones are primary: each has all runs of both blocks.
@@ -71,6 +83,7 @@ PRIMARY = {
     "unshielded": Entry("unshielded", everywhere=True),
     "trusting:20": Entry("trusting:20"),
     "shielded": Entry("shielded", everywhere=True),
+    "shielded, disturbance": Entry("shielded", observed="disturbance"),
     "shield at test": Entry("unshielded", "shielded", everywhere=True),
     "shield in training": Entry("shielded", "unshielded", everywhere=True),
 }
@@ -78,7 +91,10 @@ SECONDARY = {
     "penalized": Entry("penalized", seeds=5),
     "lagrangian": Entry("lagrangian", seeds=5),
     "lagrangian:0.1": Entry("lagrangian:0.1", seeds=5),
+    "lagrangian:1": Entry("lagrangian:1", seeds=5),
     "unshielded, attacked": Entry("unshielded", attacked=True, seeds=5),
+    "shielded, memory": Entry("shielded", observed="memory", seeds=5),
+    "lookahead": Entry("lookahead", seeds=5),
 }
 REGULATED = {
     "lqr": Entry("lqr", everywhere=True),
@@ -87,6 +103,8 @@ REGULATED = {
     **{f"lqr+{name}": Entry(f"lqr+{name}") for name in ("trusting:20", "psf:20", "psf:tube")},
     "lqr+shielded": Entry("lqr+shielded", everywhere=True),
     "lqr:observer+shielded": Entry("lqr:observer+shielded", everywhere=True),
+    "lqr:observer+ellipsoid": Entry("lqr:observer+shielded", safe_set="ellipsoid"),
+    "lqr:observer+lookahead": Entry("lqr:observer+lookahead"),
 }
 # Policies that are the same in all runs need fewer.
 REGULATED = {name: replace(entry, seeds=4) for name, entry in REGULATED.items()}
@@ -244,13 +262,15 @@ def _block(settings: CompareSettings, names: Sequence[str]) -> dict[str, Any]:
     certificate = certificate_of(loop, None, settings.safe_set)
 
     def runs_of(entry: Entry, arm: str, point: str = "") -> list[TrainingRun]:
-        count = min(settings.seeds, entry.seeds or settings.seeds)
-        runs = [run_of_arm(settings, loop, certificate, arm, index, point) for index in range(count)]
-        if not entry.attacked:
-            return runs
-        return [
-            replace(each, grid_point="attacked", training_loop=under(ATTACKED, each.training_loop)) for each in runs
-        ]
+        own = certificate_of(loop, None, entry.safe_set) if entry.safe_set else certificate
+        point = point or ("attacked" if entry.attacked else entry.observed or entry.safe_set)
+        runs = []
+        for index in range(min(settings.seeds, entry.seeds or settings.seeds)):
+            each = run_of_arm(settings, loop, own, arm, index, point)
+            if entry.attacked:
+                each = replace(each, training_loop=under(ATTACKED, each.training_loop))
+            runs.append(_seeing(entry, each, settings) if entry.observed else each)
+        return runs
 
     tested = {name: ENTRIES[name] for name in names if ENTRIES[name].tested}
     trained = dict.fromkeys([*(name for name in names if name not in tested), *(each.arm for each in tested.values())])
@@ -266,6 +286,19 @@ def _block(settings: CompareSettings, names: Sequence[str]) -> dict[str, Any]:
     for name, found in _judged(second, settings).items():
         numbers[name] = found | {key: numbers[tested[name].arm][key] for key in ("training", "curve")}
     return {name: numbers[name] for name in names}
+
+
+def observing(what: str, loop: LoopConfig) -> LoopConfig:
+    """Returns a loop in which agents see more than the estimate: "disturbance" or "memory", or nothing for no word."""
+    seen = {"": None, "disturbance": Shown(loop.env), "memory": Remembered()}
+    return replace(loop, observed=seen[what])
+
+
+def _seeing(entry: Entry, run: TrainingRun, settings: CompareSettings) -> TrainingRun:
+    """Returns a run whose agents see more than the estimate, with what was tuned for them."""
+    own = tuned_training(run.loop.env, entry.tuned_as).get("hyperparams", {})
+    loops = {name: observing(entry.observed, getattr(run, name)) for name in ("training_loop", "loop")}
+    return replace(run, settings=with_changes(settings.all_hyperparams, own), **loops)
 
 
 def _judged(runs: Mapping[Any, Sequence[TrainingRun]], settings: CompareSettings) -> dict[Any, dict[str, Any]]:
@@ -431,8 +464,9 @@ def differences_table(found: dict[str, Any]) -> str:
     """Returns the sentences about who is better, as numbers of both blocks: see the page."""
     pairs = (
         ("violating", ATTACKED, 100.0, "unshielded", "shielded"),
-        ("violating", ATTACKED, 100.0, "trusting:20", "shielded"),
         ("return", AS_TRAINED, 1.0, "shielded", "shield at test"),
+        ("return", AS_TRAINED, 1.0, "shielded, disturbance", "shielded"),
+        ("return", AS_TRAINED, 1.0, "lqr:observer+shielded", "shielded, disturbance"),
         ("return", AS_TRAINED, 1.0, "lqr:observer+shielded", "shielded"),
     )
     rows = [["first less second", "by block", "interval"]]

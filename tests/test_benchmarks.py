@@ -5,9 +5,10 @@ from functools import wraps
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from benchmarks import learning, project
+from benchmarks import learning, networks, project
 from benchmarks.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -78,3 +79,9 @@ def test_search_chooses_the_weights_that_return_most_and_measures_nothing_twice(
     monkeypatch.setattr(learning, "evaluate", None)
     learning.tune_arms(**given)
     assert capsys.readouterr().out == first
+
+
+def test_an_hour_without_an_end_says_what_it_rules_out():
+    assert networks.Measured(0, 1.0, 1.0).interval == pytest.approx((0.0, -np.log(0.025)))
+    low, high = networks.Measured(40, 2.0, 1.0).interval  # 40 ends: Garwood's interval is [28.58, 54.47]
+    assert (low, high) == pytest.approx((28.58 / 2.0, 54.47 / 2.0), abs=5e-3)

@@ -71,6 +71,27 @@ def test_no_controller_bears_what_noise_hides_and_a_certificate_bears_less():
         synthesize(bounded_by(2.01), contract=ChannelContract(1))
 
 
+def test_no_controller_bears_a_constant_disturbance_that_no_equilibrium_balances():
+    """x+ = .5 x + .1 u + d of two states, one with an end at -1 alone, rests within |x|, |u| <= 1 if |d| <= .6."""
+
+    def bounded_by(scale, E=((1.0,), (-1.0,))):
+        limits = Limits(([-1.0, -1.0], [1.0, np.inf]), [1.0])
+        bounds = Bounds(Through(E, Box([-0.2 * scale], [0.2 * scale])), [1e-3] * 2, [1e-3] * 2)
+        return LinearPlant(Model(0.5 * np.eye(2), [[0.1], [0.0]], np.eye(2), 0.1), limits, bounds)
+
+    most = script.impossible_beyond(bounded_by(1.0), np.full(2, 1e-3), 2)
+    assert isinstance(most, Fraction)
+    assert float(most) == pytest.approx(2.5, rel=1e-9)  # the other state, which no input moves, needs |d| <= .5
+    assert float(script.impossible_beyond(bounded_by(1.0, [[1.0], [0.0]]), np.zeros(2), 2)) == pytest.approx(3.0)
+
+
+def test_a_rocket_is_refused_for_what_no_controller_can_bear(capsys):
+    """A constant gust takes its angle of attack to 1.03 of the limit."""
+    script.impossible(("tvc_rocket", "ctms_cruise"))
+    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert printed[1:] == [["tvc_rocket", "0.971"], ["ctms_cruise", "5.500"]]
+
+
 def test_plant_has_a_certificate_with_another_ellipsoid_around_its_first_error():
     """The smallest one around the box of first errors leaves nothing of the limits of the ball and plate."""
     plant, p = script.plant_of("bap_gepoc"), script.published()["bap_gepoc"]

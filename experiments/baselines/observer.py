@@ -30,12 +30,15 @@ class DisturbanceObserver:
     Args:
         env: A single environment with the plant and the networks.
         alpha: Between 0 and 1.
+
+    Attributes:
+        largest: The plant's bound of disturbances in each coordinate, shape (n,).
     """
 
     def __init__(self, env: NCSEnv, alpha: float) -> None:
         plant, recursion = env.plant, env.loop.histories(env.channel).recursion
         self._A, self._B, self._alpha, self._delay = plant.A, plant.B, alpha, env.downlink_protocol.input_delay
-        self._largest = np.sqrt(np.diag(plant.nominal_disturbance.shape_matrix))
+        self.largest = np.sqrt(np.diag(plant.nominal_disturbance.shape_matrix))
         eye, P = np.eye(plant.n), recursion.first.covariance
         gain = np.zeros((plant.n, len(plant.H)))
         for _ in range(_SETTLED):
@@ -47,8 +50,13 @@ class DisturbanceObserver:
         self._lags = np.array(lags)
         self._before: tuple[np.ndarray, np.ndarray] | None = None  # estimates (N, n) and lags (N, n, n)
 
-    def see(self, infos: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns x and d_hat, shape (N, n) each, after a step or the beginning of episodes."""
+    def see(self, infos: dict[str, Any], fresh: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Returns x and d_hat, shape (N, n) each, after a step or the beginning of episodes.
+
+        Args:
+            infos: Those of a vector environment.
+            fresh: Loops that took a step or began, bool (N,); the others are as they were. None for all.
+        """
         estimates, begun = infos["estimate"], infos["episode_steps"] == 0
         lags = self._lags[np.minimum(infos["measurement_age"] + self._delay, _OLDEST)]
         if self._before is None or len(estimates) != len(self._before[0]):
@@ -60,6 +68,7 @@ class DisturbanceObserver:
             now = estimates + np.einsum("kij,kj->ki", lags, d)
             seen = now - last @ self._A.T - infos.get("input_committed", infos["input"]) @ self._B.T
             d = d + np.where(begun[:, None], 0.0, self._alpha * (seen - d))
-            self.disturbance = np.clip(d, -self._largest, self._largest)
+            d = np.clip(d, -self.largest, self.largest)
+            self.disturbance = d if fresh is None else np.where(fresh[:, None], d, self.disturbance)
         self._before = estimates.copy(), lags
         return estimates + np.einsum("kij,kj->ki", lags, self.disturbance), self.disturbance

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,7 +196,9 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
     values = dict(vars(loop))
     for name in ("shield", "filter"):
         values[name] = values[name] and vars(values[name]) | {"certificate": certificate}
-    return values | {"lagrangian": loop.lagrangian and asdict(loop.lagrangian)}
+    for name in ("observed", "lagrangian"):
+        values[name] = values[name] and [type(values[name]).__name__, vars(values[name])]
+    return values
 
 
 def _agent_of(run: TrainingRun) -> Agent | None:
