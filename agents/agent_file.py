@@ -42,19 +42,14 @@ def read_files(folder: str | Path) -> dict[str, bytes]:
 
 def pretrained_folder(env_id: str) -> Path:
     """Returns the folder of the small agent that comes with the package for an id; raises AgentError if it has none."""
-    found = _pretrained()
+    found = pretrained_folders()
     if env_id not in found:
         raise AgentError(f"there is no pretrained agent of {shown(env_id)}, only of {', '.join(found)}")
     return found[env_id]
 
 
-def has_pretrained(env_id: str) -> bool:
-    """Returns whether an agent of an environment comes with the package."""
-    return env_id in _pretrained()
-
-
-def _pretrained() -> dict[str, Path]:
-    """Returns the folders by id."""
+def pretrained_folders() -> dict[str, Path]:
+    """Returns the folders of the agents that come with the package by id."""
     root = Path(str(resources.files("agents"))) / "trained"
     return {f"ncs_gym/{file.parent.name}": file.parent for file in sorted(root.glob("*/agent.json"))}
 

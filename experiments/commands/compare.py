@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from agents.agent_file import has_pretrained
+from agents.agent_file import pretrained_folders
 from experiments.analysis.episodes import (
     arm_summaries,
     episodes_table,
@@ -126,7 +126,7 @@ def compare(settings: CompareSettings) -> None:
 def shortened(settings: CompareSettings) -> CompareSettings:
     """Returns the settings of the short version if `--smoke` is given; see `short_version`."""
     chosen, default = {}, type(settings)
-    pair = _SMOKE_PAIR if has_pretrained(id_alone(settings.env)) else ()
+    pair = _SMOKE_PAIR if id_alone(settings.env) in pretrained_folders() else ()
     if settings.arms == default.arms:
         chosen["arms"] = _SMOKE_ARMS + pair
     if settings.baselines == default.baselines and pair:

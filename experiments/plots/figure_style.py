@@ -31,7 +31,6 @@ STYLE: dict[Any, Any] = {
 }
 # Mean width of a letter and of a handle in a legend [inches].
 _LETTER, _HANDLE = 0.085, 0.6
-_SQUARED = "\N{SUPERSCRIPT TWO}"
 
 
 class CaptionedFigure(Figure):
@@ -49,11 +48,6 @@ class CaptionedFigure(Figure):
         with matplotlib.rc_context(STYLE):
             self.savefig(buffer, format="png", metadata={"Software": ""})
         return buffer.getvalue()
-
-
-def with_unit(name: str, unit: str) -> str:
-    """Returns an axis label; some plants have no units."""
-    return f"{name} [{unit}]".replace("^2", _SQUARED) if unit else name
 
 
 def label(axis: Axes, x: str, y: str, title: str = "") -> None:
