@@ -42,7 +42,7 @@ for name, loop in (("without a shield", bare), ("with a shield", SafetyShield(ot
     for step in range(400):
         action = np.full(2, 1.0 if step // 100 % 2 == 0 else -1.0, np.float32)
         _, _, _, _, info = loop.step(action)
-        levels = plant.from_deviation(info["state"])
+        levels = info["state"] + plant.operating_state
         lowest, highest = np.minimum(lowest, levels), np.maximum(highest, levels)
         violations += int(info["cost"])
     reached = ", ".join(f"{low:.1f} to {high:.1f}" for low, high in zip(lowest, highest, strict=True))

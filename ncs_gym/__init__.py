@@ -6,7 +6,6 @@ from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel
 from ncs_gym.envs.request_actions import RequestActions, VectorRequestActions
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSetError, UnstablePlantError
-from ncs_gym.installation import warn_of_overwritten_packages
 from ncs_gym.limits import Limits
 from ncs_gym.model import Model
 from ncs_gym.network.actuator import Actuator, Echo
@@ -37,7 +36,6 @@ from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 __version__ = "0.1.0"
 
-warn_of_overwritten_packages()
 register_all()
 
 __all__ = [

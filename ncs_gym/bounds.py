@@ -5,8 +5,8 @@ A number or a vector stands for half-widths per entry. Ellipsoids around sets ar
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,6 +22,7 @@ from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_matrix, as_numb
 SMALLEST_SIZE, LARGEST_SIZE = 1e-37, 1e37
 # Probability that Gaussian noise of the library is truncated at, and that of what is zero.
 DELTA = 0.05
+_NAMES = "disturbance", "sensor", "first_error"
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,20 +37,19 @@ class Box(UncertainSet):
     high: Any
 
     def __post_init__(self) -> None:
-        ends: list[Any] = [as_setting(self.low), as_setting(self.high)]
+        given: Any = self.low, self.high
+        ends: list[Any] = [*map(as_setting, given)]
         fits = all(each is not None and each.ndim <= 1 and each.size and np.isfinite(each).all() for each in ends)
         fits = fits and len({*map(np.shape, ends)} - {()}) <= 1
         low, high = np.array(np.broadcast_arrays(*ends)) if fits else np.array([1.0, 0.0])
         self._set(low=low, high=high, middle=0.5 * (high + low), size=low.size if low.ndim else None)
         if not ((self.half == 0.0) | (self.half >= SMALLEST_SIZE) & (self.half <= LARGEST_SIZE)).all():
-            raise ValueError(
-                "a box needs two finite ends, low <= high, numbers or vectors of one size, half-widths being 0 or from "
-                f"{SMALLEST_SIZE:g} to {LARGEST_SIZE:g}, got {shown(self.low)} and {shown(self.high)}"
-            )
+            form = f"low <= high of one size, half-widths being 0 or from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
+            raise ValueError(f"a box needs two finite ends, {form}, got {shown(given)}")
 
     @cached_property
     def half(self) -> np.ndarray:
-        """Half-widths, shape (n,), or a number: the farther end from the middle, which rounding may have moved."""
+        """Half-widths, shape (n,), or a number, by the farther end from the rounded middle."""
         return np.maximum(self.high - self.middle, self.middle - self.low)
 
     def sized(self, size: int) -> Any:  # noqa: D102
@@ -119,11 +119,7 @@ class Gaussian(UncertainSet):
 
 @dataclass(frozen=True, eq=False)
 class Through(UncertainSet):
-    """{E w : w in a set}, E of shape (n, q); half-widths of w are a set, too.
-
-    A Gaussian is refused, since what holds except with a probability must be seen as that: it has a covariance E P E'.
-    A remainder is, too, since it holds only inside the limits.
-    """
+    """{E w : w in a set}, E of shape (n, q); no Gaussian, which is one of covariance E P E', and no remainder."""
 
     E: Any
     set: Any
@@ -132,10 +128,7 @@ class Through(UncertainSet):
         E = as_matrix(self.E, (None, None), "E of a set through E")
         own = as_set(self.set).sized(E.shape[1])
         if any(isinstance(each, Gaussian) or each.is_left_out for each in Sum((own,)).parts):
-            raise ValueError(
-                "a Gaussian or a remainder is not taken through E: give a Gaussian of covariance E P E', or the "
-                "remainder of the states itself"
-            )
+            raise ValueError("Through takes no Gaussian, of which E P E' is a covariance, and no remainder")
         self._set(E=E, set=own, size=len(E), middle=E @ np.broadcast_to(own.middle, E.shape[1]))
         self.ellipsoid()
 
@@ -153,7 +146,7 @@ class Through(UncertainSet):
 
 @dataclass(frozen=True, eq=False)
 class Sum(UncertainSet):
-    """All sums of one vector from each of several sets, of which one may be a Gaussian; `a + b` is one, too."""
+    """All sums of one vector from each of several sets, of which one may be a Gaussian; `a + b` makes one."""
 
     parts: tuple[Any, ...]
 
@@ -195,7 +188,7 @@ class Sum(UncertainSet):
 def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns all E, shape (n, q), and w, shape (q,), whose E w add up to the middle of a set; none is zero.
 
-    Where E is a product, what its rounding lost follows as another one.
+    What the rounding of a product E lost is another one.
     """
     if isinstance(own, Sum):
         return [each for part in own.parts for each in pushes_of(part)]
@@ -210,11 +203,7 @@ def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def as_set(value: Any) -> Any:
-    """Returns the set that is given, that of a document, or the box of half-widths, a number or shape (n,).
-
-    Raises:
-        ValueError: If it is none of these.
-    """
+    """Returns a set, that of a document, or the box of half-widths, a number or shape (n,); or raises ValueError."""
     if isinstance(value, UncertainSet):
         return value
     name, content = next(iter(value.items()), ("", 0)) if isinstance(value, Mapping) and len(value) == 1 else ("", 0)
@@ -224,24 +213,21 @@ def as_set(value: Any) -> Any:
             return kinds[name](**content)
     half = as_setting(value)
     if half is None or half.ndim > 1:
-        raise ValueError(
-            f"a set must be a number, a vector of half-widths or one of {', '.join(kinds)}, got {shown(value)}"
-        )
+        raise ValueError(f"a set must be a number, half-widths or one of {', '.join(kinds)}, got {shown(value)}")
     return Box(-half, half)
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds(ReadOnlyArrays):
-    """What bounds the uncertainties of a plant: half-widths, a number or a vector, or sets; 0 says that there is none.
+    """What bounds the uncertainties of a plant: sets, or half-widths, numbers or vectors; 0 says that there is none.
 
     Attributes:
-        disturbance: Of d in x+ = A x + B u + d. A set whose middle is not zero moves the point that deviations are
-            counted from (`LinearPlant`).
+        disturbance: Of d in x+ = A x + B u + d; its middle moves the point that deviations are counted from.
         sensor: Of v in y = H x + v, about zero.
         first_error: Of the error of the first estimate, about zero.
 
     Raises:
-        ValueError: If one is no set, or that of sensors or of the first error is not about zero.
+        ValueError: If one is no set, or one about zero is not.
     """
 
     disturbance: Any
@@ -249,49 +235,36 @@ class Bounds(ReadOnlyArrays):
     first_error: Any
 
     def __post_init__(self) -> None:
-        for name in ("disturbance", "sensor", "first_error"):
-            with _naming(name):
-                self._set(**{name: as_set(getattr(self, name))})
-            if name != "disturbance" and np.any(middle := getattr(self, name).middle):
-                found = shown(np.asarray(middle).tolist())
-                raise ValueError(f"Bounds({name}=...) must have its middle at zero, got {found}")
+        for name in _NAMES:
+            try:
+                own = as_set(getattr(self, name))
+            except ValueError as error:
+                raise ValueError(f"Bounds({name}=...): {error}") from error
+            self._set(**{name: own})
+            middle = np.array(own.middle)
+            if name != "disturbance" and middle.any():
+                raise ValueError(f"Bounds({name}=...) must have its middle at zero, got {shown(middle.tolist())}")
 
     def sums(self, n: int, p: int) -> list[Sum]:
-        """Returns the three sets as sums, checked to be those of a plant with n states and p outputs.
-
-        Raises:
-            ValueError: If one is a set in another dimension, or they are not allowed beside each other.
-        """
-        sums = [Sum((each,)) for each in (self.disturbance, self.sensor, self.first_error)]
+        """Returns the three as sums of sets of a plant with n states and p outputs, or raises ValueError."""
+        sums = [Sum((getattr(self, name),)) for name in _NAMES]
         left_out = [sum(part.is_left_out for part in each.parts) for each in sums]
         if left_out[0] > 1 or any(left_out[1:]):
             raise ValueError("Bounds of disturbances may have one remainder, and others none")
         if len(deltas := {each.gaussian.delta for each in sums if each.gaussian}) > 1:
             raise ValueError(f"all Gaussians of a plant must have the same delta, got {shown(sorted(deltas))}")
-        for name, each, size in zip(("disturbance", "sensor", "first_error"), sums, (n, p, n), strict=True):
-            with _naming(name):
-                each.sized(size)
+        for name, each, size in zip(_NAMES, sums, (n, p, n), strict=True):
+            if each.size not in (None, size):
+                needed = f"a set in dimension {size} is needed, got one in dimension {each.size}"
+                raise ValueError(f"Bounds({name}=...): {needed}")
         return sums
 
 
-@contextmanager
-def _naming(name: str) -> Iterator[None]:
-    """Says in what is refused which of the bounds it is."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"Bounds({name}=...): {error}") from error
-
-
 def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
-    """Returns Gaussian noise, of which 95 % count, whose bounds are in proportion to the safe box.
+    """Returns Gaussian noise, of which 95 % count, in proportion to half-widths of a safe box, shape (n,).
 
-    Args:
-        half_widths: Of the safe box, shape (n,).
-        H: Output matrix, shape (p, n).
-        disturbance: Bound of process noise, as a fraction of the half-widths.
-        sensor: Bound of sensor noise, as a fraction of what the box allows the outputs; of the first error in each
-            state, of the smallest half-width.
+    Process noise is bounded by a fraction of them, sensor noise by one of what they allow outputs H x, and the first
+    error by that of the smallest one.
     """
     outputs, smallest = exact.product(np.abs(H), half_widths), np.full(len(half_widths), half_widths.min())
     sizes = disturbance * half_widths, sensor * outputs, sensor * smallest

@@ -1,8 +1,8 @@
 """Numbers that come out the same on every machine: computed in rational or ball arithmetic, then rounded once.
 
 BLAS, LAPACK and SIMD round differently on different processors. What identifies a plant, and every number that a proof
-takes from it, is made by these functions, or by single operations of float64 (+, -, *, /, sqrt), which the standard
-IEEE 754 prescribes to the last bit. FLINT computes (https://flintlib.org).
+takes from it, is made by these functions, or by single operations of float64 (+, -, *, /, sqrt), which IEEE 754
+prescribes to the last bit. FLINT computes (https://flintlib.org).
 """
 
 from __future__ import annotations
@@ -22,11 +22,7 @@ SMALLEST, LARGEST = arb(2) ** -1080, arb(2) ** 1025
 
 
 def product(*factors: np.ndarray) -> np.ndarray:
-    """Returns the product of finite float matrices, every entry rounded once; a vector counts as a column at the end.
-
-    Args:
-        factors: Shapes (n, k), (k, l), .., the last one (l, p) or (l,).
-    """
+    """Returns the product of float matrices, the last of which may be a vector, every entry rounded once."""
     if not len(factors[0]):
         return np.zeros((0, *factors[-1].shape[1:]))
     columns = [*factors[:-1], factors[-1].reshape(len(factors[-1]), -1)]
@@ -35,16 +31,12 @@ def product(*factors: np.ndarray) -> np.ndarray:
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Returns the inverse of a float matrix, shape (n, n), every entry rounded once.
-
-    Raises:
-        ZeroDivisionError: If it is singular.
-    """
+    """Returns the inverse of a float matrix, every entry rounded once; raises ZeroDivisionError if it is singular."""
     return _rounded(_rational(matrix).inv())
 
 
 def rank(matrix: np.ndarray) -> int:
-    """Returns the rank of a float matrix, whatever its units."""
+    """Returns the rank of a float matrix."""
     return int(_rational(matrix).rank())
 
 
@@ -54,14 +46,9 @@ def total(values: np.ndarray) -> float:
 
 
 def rounded(numbers: np.ndarray | float, digits: int, axis: int | None = None) -> np.ndarray:
-    """Returns numbers of any shape, rounded to this many decimal digits of the largest one.
+    """Returns finite numbers, rounded to so many decimal digits of the largest one, or of that along an axis.
 
-    What was computed with BLAS, and differs between machines in its last bits, is nearly always the same after that.
-
-    Args:
-        numbers: Finite.
-        digits: Significant digits of the largest number.
-        axis: None for the largest of all; an axis for the largest along it.
+    What BLAS computed, and differs between machines in its last bits, is nearly always the same after that.
     """
     array = np.asarray(numbers, dtype=np.float64)
     largest = np.broadcast_to(np.abs(array).max(axis=axis, keepdims=axis is not None, initial=0.0), array.shape)
@@ -75,7 +62,7 @@ def _exponent(size: float) -> int:
 
 
 def largest_eigenvalue(symmetric: np.ndarray) -> float:
-    """Returns the smallest float64 that no eigenvalue of a semidefinite float matrix, shape (n, n), exceeds."""
+    """Returns the smallest float64 that no eigenvalue of a semidefinite float matrix exceeds."""
     low, high = float(np.diag(symmetric).max()), math.nextafter(total(np.diag(symmetric)), math.inf)
     matrix = _rational(symmetric)
     if _bounds(low, matrix):
@@ -104,10 +91,7 @@ def exponential(generator: np.ndarray, time: float) -> np.ndarray:
 
 
 def nearest(balls: Callable[[], list[Any]]) -> list[float]:
-    """Returns the float64 numbers next to some real numbers.
-
-    Args:
-        balls: Returns enclosures at the precision of FLINT's context; it is called with more and more of it.
+    """Returns the float64 numbers next to real numbers, given enclosures at the precision of FLINT's context.
 
     Raises:
         OverflowError: If no precision encloses them, or one is too large for a float64.

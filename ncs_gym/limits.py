@@ -37,12 +37,9 @@ class ChosenLimitsWarning(UserWarning):
 
 
 class Rows(NamedTuple):
-    """Limits low <= c_j x <= high, or of states and inputs low <= c_j (x, u) <= high, in units of half their range.
+    """Limits low <= c_j x <= high, or low <= c_j (x, u) <= high: c, shape (k, n) or (k, n + m), and ends, (2, k).
 
-    Attributes:
-        rows: c, shape (k, n) or (k, n + m): half the range of a row is 1; where an end is infinite, the other one is -1
-            or 1.
-        ends: Their low and their high ends, shape (2, k); infinite where there is none.
+    They are in units of half the range, or of the other end where one is infinite.
     """
 
     rows: np.ndarray
@@ -50,7 +47,7 @@ class Rows(NamedTuple):
 
     @classmethod
     def of(cls, rows: np.ndarray, ends: np.ndarray) -> Rows:
-        """Returns those of rows, (k, n), with ends in their own units, (2, k), that have any finite end."""
+        """Returns those, given in any units, that have a finite end."""
         limited = np.isfinite(ends).any(axis=0)
         rows, (low, high) = rows[limited], ends[:, limited]
         half = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * (high - low), np.minimum(-low, high))
@@ -59,11 +56,8 @@ class Rows(NamedTuple):
     @classmethod
     def joined(cls, parts: Sequence[Rows], size: int) -> Rows:
         """Returns all rows of several, each with this many entries."""
-        rows, ends = [np.empty((0, size))], [np.empty((2, 0))]
-        return cls(
-            np.concatenate(rows + [each.rows for each in parts]),
-            np.concatenate(ends + [each.ends for each in parts], axis=1),
-        )
+        rows, ends = zip((np.empty((0, size)), np.empty((2, 0))), *parts, strict=True)
+        return cls(np.concatenate(rows), np.concatenate(ends, axis=1))
 
 
 class LimitValues(ReadOnlyArrays):
@@ -74,18 +68,14 @@ class LimitValues(ReadOnlyArrays):
         B: Input matrix, shape (n, m).
         H: Output matrix, shape (p, n).
         past: How many of the last states are past inputs, the newest ones last.
-        box: Rows c_j of the safe box, shape (k, n), in units of half the range that is allowed; where one end is open,
-            the other one is 1 unit away.
-        box_ends: The low and the high ends of c_j x, shape (2, k); -1 and 1 where limits are symmetric, infinite where
-            there is none.
+        box: Rows c_j of the safe box, shape (k, n), in units of half the range, or of the other end where one is open.
+        box_ends: Low and high ends of c_j x, shape (2, k); -1 and 1 where symmetric, infinite where there is none.
         is_past_row: Which rows limit past inputs, which nothing ever takes there, shape (k,).
-        mixed_rows: Rows of limits on (x, u) at the beginning of a step, shape (q, n + m), in units as those of `box`.
-        mixed_ends: Their low and high ends, shape (2, q).
-        input_ends: The low and the high ends of the inputs, shape (2, m).
-        operating_state: State that deviations are counted from, shape (n,); for conversion and text.
-        operating_input: Input that deviations are counted from, shape (m,).
-        step_offset: Sizes of what the operating point rests under in every step beside A and B, shape (n,), which do
-            not cancel: |offset|, and |E| |middle| of a disturbance with two ends.
+        mixed_rows, mixed_ends: Alike, of (x, u) at the beginning of a step, shapes (q, n + m) and (2, q).
+        input_ends: Low and high ends of the inputs, shape (2, m).
+        operating_state, operating_input: What deviations are counted from, shapes (n,) and (m,).
+        step_offset: Sizes of what the operating point rests under in every step beside A and B, shape (n,): |offset|,
+            and |E| |middle| of a disturbance with two ends.
         lacking: What the point lacks of an equilibrium by rounding, in size, of the model's own states.
     """
 
@@ -116,7 +106,7 @@ class LimitValues(ReadOnlyArrays):
         return {name: getattr(self, name) for name in LimitValues.__annotations__}
 
     def around(self, x: np.ndarray, u: np.ndarray) -> LimitValues:
-        """Returns the same plant counted from another point, which is (x, u) from here: its ends move."""
+        """Returns the same counted from another point, which is (x, u) from here: ends move."""
         return self.replaced(
             box_ends=self.box_ends - exact.product(self.box, x),
             mixed_ends=self.mixed_ends - exact.product(self.mixed_rows, np.concatenate([x, u])),
@@ -124,12 +114,6 @@ class LimitValues(ReadOnlyArrays):
             operating_state=self.operating_state + x,
             operating_input=self.operating_input + u,
         )
-
-    @property
-    def is_within(self) -> bool:
-        """Whether the point is strictly within the limits."""
-        low, high = np.concatenate([self.box_ends, self.input_ends, self.mixed_ends], axis=1)
-        return bool(((low < 0.0) & (high > 0.0)).all())
 
     @cached_property
     def spectral_radius(self) -> float:
@@ -155,10 +139,7 @@ class LimitValues(ReadOnlyArrays):
 
     def _if_symmetric(self, value: np.ndarray) -> np.ndarray:
         if not self.is_symmetric:
-            raise ValueError(
-                "the limits of this plant are not |c_j x| <= 1 and |u_i| <= u_max_i alone, and only these are taken by "
-                "what was asked for (a plant has box, box_ends, input_ends, mixed_rows and mixed_ends)"
-            )
+            raise ValueError("this needs limits |c_j x| <= 1 and |u_i| <= u_max_i alone, and the plant has others")
         return value
 
     @cached_property
@@ -176,18 +157,13 @@ class LimitValues(ReadOnlyArrays):
         return read_only(half)
 
     @cached_property
-    def input_scales(self) -> tuple[tuple[float, float], ...]:
-        """`input_middle` and `input_half` of each input as numbers."""
-        return tuple(zip(self.input_middle.tolist(), self.input_half.tolist(), strict=True))
-
-    @cached_property
     def largest_input(self) -> np.ndarray:
         """The largest |u_i| within the limits, shape (m,)."""
         return read_only(np.abs(self.input_ends).max(axis=0))
 
     @cached_property
     def own_limits(self) -> np.ndarray:
-        """The closest limits of each state alone, low and high ends of shape (2, n); infinite where an end is open."""
+        """The closest low and high ends of each state alone, shape (2, n); infinite where one is open."""
         low, high = np.full((2, len(self.A)), [[-np.inf], [np.inf]])
         for row, ends in zip(self.box, self.box_ends.T, strict=True):
             if np.count_nonzero(row) == 1:
@@ -198,10 +174,7 @@ class LimitValues(ReadOnlyArrays):
 
     @cached_property
     def reach(self) -> np.ndarray:
-        """The largest |x_j| in the safe box and |u_i| within the limits, shape (n + m,); infinite for a free state.
-
-        Of states that are past inputs those are the inputs' limits, which they never leave.
-        """
+        """The largest |x_j| in the safe box and |u_i| within the limits, shape (n + m,); infinite for a free state."""
         n, m = self.B.shape
         two_ends = np.isfinite(self.box_ends).all(axis=0)
         limited, reach = self.box[two_ends].any(axis=0), np.full(n, np.inf)
@@ -212,7 +185,7 @@ class LimitValues(ReadOnlyArrays):
         return read_only(np.concatenate([reach, self.largest_input]))
 
     def _widest(self, states: Any = slice(None)) -> np.ndarray:
-        """Returns bounds of some |x_i| in the safe box: x = (C'C)^-1 C' (C x) for the rows C that have two ends.
+        """Returns bounds of some |x_i| in the safe box by x = (C'C)^-1 C' (C x), C having two ends.
 
         Raises:
             ZeroDivisionError: If the box does not bound each of these.
@@ -223,51 +196,37 @@ class LimitValues(ReadOnlyArrays):
         return (np.abs(exact.product(exact.inverse(gram), rows.T)) * sizes).sum(axis=1)
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
-        """Returns how far c_j x is beyond the nearer end, in units of half the range, for each row of the safe box.
+        """Returns how far c_j x is beyond the nearer end, in units of half the range, shape (k,) or (k, N).
 
-        Shape (k,) or (k, N); positive is violated. With symmetric limits that is |c_j x| - 1.
+        Positive is violated. With symmetric limits that is |c_j x| - 1.
         """
         return _beyond(self.box.dot(state), self.box_ends)
 
     def mixed_values(self, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns how far the rows of `mixed_rows` are beyond the nearer end, in units of half their range.
-
-        Shape (q,) or (q, N), for states of shape (n,) or (n, N) and inputs of shape (m,) or (m, N).
-        """
+        """Returns the same of `mixed_rows`, shape (q,) or (q, N)."""
         rows, n = self.mixed_rows, len(self.A)
         return _beyond(rows[:, :n].dot(state) + rows[:, n:].dot(u), self.mixed_ends)
 
     def values_at_start(self, state: np.ndarray) -> np.ndarray:
-        """Returns `worst_constraint_values` where no step has been: those of a state at which the operating input acts.
-
-        Shape (k + q,) or (k + q, N), for a state of shape (n,) or (n, N).
-        """
-        values = self.constraint_values(state)
-        if not len(self.mixed_rows):
-            return values
-        return np.concatenate([values, self.mixed_values(state, np.zeros((self.B.shape[1], *state.shape[1:])))])
+        """Returns `worst_constraint_values` before a step: those of a state at which the operating input acts."""
+        rest = np.zeros((self.B.shape[1], *state.shape[1:]))
+        return np.concatenate([self.constraint_values(state), self.mixed_values(state, rest)])
 
 
 def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Returns a bound on every |x_j|, shape (n,), n steps after |x| <= reach, (n,), with |u| <= largest_input, (m,)."""
+    """Returns a bound on every |x_j|, shape (n,), n steps after |x| <= reach, with |u| <= largest_input."""
     for _ in range(len(A)):
         reach = exact.product(np.abs(np.hstack([A, B])), np.concatenate([reach, largest_input]))
     return reach
 
 
 def _beyond(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Returns how far values, shape (k,) or (k, N), are beyond the nearer of their ends, shape (2, k)."""
     low, high = ends if values.ndim == 1 else ends[:, :, None]
     return np.maximum(values - high, low - values)
 
 
 def sides(limits: Any, size: int, name: str) -> np.ndarray:
-    """Returns the low and the high ends of limits, shape (2, size); infinite where there is none.
-
-    Args:
-        limits: Pair (low, high), each a number or shape (size,), possibly infinite.
-        size: Number of limited quantities.
-        name: What the error message calls the limits.
+    """Returns the low and the high ends of a pair of numbers or vectors, shape (2, size), some of them infinite.
 
     Raises:
         ValueError: If it is no such pair, or a low end is not below the high one.
@@ -276,27 +235,23 @@ def sides(limits: Any, size: int, name: str) -> np.ndarray:
     fits = len(ends) == 2 and all(side is not None and side.shape in ((), (size,)) for side in ends)
     both = np.array([np.broadcast_to(side, (size,)) for side in ends]) if fits else np.zeros((2, 1))
     if not (both[0] < both[1]).all():
-        raise ValueError(
-            f"{name} must be (low, high), each a number or of shape ({size},), with low < high everywhere: all low "
-            f"ends, then all high ones, got {shown(limits)}"
-        )
+        form = f"(low, high), each a number or of shape ({size},), with low < high"
+        raise ValueError(f"{name} must be {form}, got {shown(limits)}")
     return both
 
 
 def _from_center(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
-    """Returns the ends of limits as distances from a point between them, shape (2, size); infinite where free.
+    """Returns the ends of a pair, shape (2, size), as distances from a point.
 
     Raises:
-        ValueError: If they are no limits, or the point is not strictly between them, by more than rounding.
+        ValueError: If it is no pair, or the point is not strictly between them, by more than rounding.
     """
     ends = sides(limits, len(center), name) - center
     finite = np.isfinite(ends)
     sizes = np.where(finite, np.array([[-1.0], [1.0]]) * ends, 1.0)
     if not ((sizes > SMALLEST_NUMBER) & (sizes < LARGEST_NUMBER)).all():
-        raise ValueError(
-            f"{name} are absolute numbers of usual size, or infinite, and must have the operating point, at=(state, "
-            f"input) of the Model, strictly between them: it is {shown(center.tolist())}, got {shown(limits)}"
-        )
+        form = "absolute, of usual size, the operating point, at=(state, input) of the Model, strictly between them"
+        raise ValueError(f"{name} must be {form}: it is {shown(center.tolist())}, got {shown(limits)}")
     nearest = sizes.min(axis=0)
     nearly = finite.all(axis=0) & (np.abs(sizes[1] - sizes[0]) <= NEARLY_SYMMETRIC * nearest)
     return np.where(nearly, [-nearest, nearest], ends)
@@ -313,7 +268,7 @@ class Limits(ReadOnlyArrays):
         rows: Limits of several entries, a list of (c_x, c_u, low, high) with low <= c_x x + c_u u <= high for the x at
             the beginning of a step and the u that is held then; c_u is None in a limit of states alone.
         rate: Largest change of each input from one step to the next, a positive number or shape (m,).
-        between_samples: Number of times per step, 2 to 64, at which limits of states count; None for the end alone.
+        between_samples: Number of times per step, 1 to 64, at which limits of states count; None for the end alone.
     """
 
     state: Any = None
@@ -323,8 +278,6 @@ class Limits(ReadOnlyArrays):
     between_samples: int | None = None
 
     def __post_init__(self) -> None:
-        if self.input is None:
-            raise ValueError("Limits need input=: actions from -1 to 1 stand for inputs from the low to the high end")
         if not isinstance(self.rows, list | tuple) or not all(
             isinstance(each, list | tuple) and len(each) == 4 for each in self.rows
         ):
@@ -347,10 +300,7 @@ class Limits(ReadOnlyArrays):
             of_states.append(Rows.of(np.eye(n), _from_center(self._pair("state", model), model.state, "state limits")))
         inputs = _from_center(self._pair("input", model), model.input, "input limits")
         if not np.isfinite(inputs).all():
-            raise ValueError(
-                "input limits must be finite, since actions from -1 to 1 stand for inputs from the low to the high "
-                f"end, got {shown(self.input)}"
-            )
+            raise ValueError(f"input limits must be finite, since actions span them, got {shown(self.input)}")
         for of_state, of_input, low, high in self.rows:
             c_x = as_point(of_state, n, "c_x of a row of limits")
             c_u = np.zeros(m) if of_input is None else as_point(of_input, m, "c_u of a row of limits")
@@ -362,13 +312,11 @@ class Limits(ReadOnlyArrays):
         box, together = Rows.joined(of_states, n), Rows.joined(mixed, n + m)
         if not len(box.rows):
             box = _chosen(model, inputs)
-        values = LimitValues()
+        values, offset = LimitValues(), np.zeros(n) if model.offset is None else np.abs(model.offset)
         values._set(A=model.A, B=model.B, H=model.H, past=0, is_past_row=np.zeros(len(box.rows), np.bool_))
         values._set(box=box.rows, box_ends=box.ends, mixed_rows=together.rows, mixed_ends=together.ends)
         values._set(input_ends=inputs, operating_state=model.state, operating_input=model.input)
-        values._set(
-            step_offset=np.zeros(n) if model.offset is None else np.abs(model.offset), lacking=np.abs(model.lacking)
-        )
+        values._set(step_offset=offset, lacking=np.abs(model.lacking))
         return values
 
     def absolute(self, model: Model) -> Limits:
@@ -386,10 +334,8 @@ class Limits(ReadOnlyArrays):
         change = as_setting(self.rate)
         fits = change is not None and change.shape in ((), half.shape) and (change >= SMALLEST_NUMBER).all()
         if change is None or not fits or not (change < 2.0 * half).any() or not np.isfinite(change).all():
-            raise ValueError(
-                f"rate must be a positive number or shape {half.shape}, smaller than the range of some input, got "
-                f"{shown(self.rate)}"
-            )
+            form = f"a positive number or shape {half.shape}, smaller than the range of some input"
+            raise ValueError(f"rate must be {form}, got {shown(self.rate)}")
         return np.broadcast_to(change, half.shape).copy()
 
     def _pair(self, name: str, model: Model) -> Any:
@@ -399,18 +345,16 @@ class Limits(ReadOnlyArrays):
         if widths is None or widths.shape not in ((), getattr(model, name).shape):
             return given
         if model.at is not None or not (widths > 0.0).all() or np.isinf(widths).all():
-            raise ValueError(
-                f"{name} limits must be positive half-widths, not all infinite, or a pair (low, high) of vectors, as "
-                f"beside at= of a Model, where they are absolute, got {shown(given)}"
-            )
+            form = "positive half-widths, not all infinite, or a pair (low, high) of vectors, as beside at= of a Model"
+            raise ValueError(f"{name} limits must be {form}, got {shown(given)}")
         return -widths, widths
 
 
 def _chosen(model: Model, inputs: np.ndarray) -> Rows:
-    """Returns half-widths for states without limits: many times what inputs within ends (2, m) reach in n steps.
+    """Returns half-widths for states without limits: FREE_REACH times what inputs within ends (2, m) reach in n steps.
 
     Raises:
-        ValueError: If no input moves a state, so that nothing says how large it gets.
+        ValueError: If no input moves a state.
     """
     reach = reach_in_steps(model.A, model.B, np.abs(inputs).max(axis=0), np.zeros(len(model.A)))
     if not reach.all():

@@ -29,14 +29,7 @@ EQUILIBRIUM_PRECISION = 1e-12
 
 
 def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the matrices of x+ = A x + B u for x' = A x + B u with u held constant over each step.
-
-    Every entry is rounded once, so that it is the same on every machine.
-
-    Args:
-        A: Continuous-time state matrix, shape (n, n) [1/s].
-        B: Continuous-time input matrix, shape (n, m).
-        dt: Duration of a step [s].
+    """Returns A and B of a step for x' = A x + B u with u held over it, shapes (n, n) and (n, m), rounded once.
 
     Raises:
         ValueError: If an entry is too large for a float64.
@@ -50,11 +43,7 @@ def zero_order_hold(A: np.ndarray, B: np.ndarray, dt: float) -> tuple[np.ndarray
 
 
 def as_point(value: Any, size: int, name: str) -> np.ndarray:
-    """Returns a vector, shape (size,); a number stands for a vector of one entry.
-
-    Raises:
-        ValueError: If it is no finite vector of this size.
-    """
+    """Returns a finite vector, shape (size,), or raises ValueError; a number stands for a vector of one entry."""
     numbers = as_numbers(value)
     return as_vector([value] if size == 1 and numbers is not None and numbers.ndim == 0 else value, size, name)
 
@@ -68,16 +57,16 @@ class Model(ReadOnlyArrays):
         B: Shape (n, m).
         H: Output matrix, shape (p, n); None for the identity.
         dt: Duration of a step [s].
-        at: State and input that deviations are counted from, shapes (n,) and (m,); None for zero. A and B are a model
-            of deviations from it, as linearization gives.
-        offset: c of a model in absolute coordinates, x+ = A x + B u + c, shape (n,): then `at` has to be an
-            equilibrium.
+        at: State and input that deviations, which A and B are a model of, are counted from, shapes (n,) and (m,); None
+            for zero.
+        offset: c of a model in absolute coordinates, x+ = A x + B u + c, shape (n,), with an equilibrium `at`.
         continuous: [Ac, Bc] of x' = Ac x + Bc u that A and B were sampled from, shape (n, n + m); None if unknown.
         delays: Steps after which each input acts on each state, shape (n, m) (`with_delays`).
         state, input: `at`, zero where it is None.
 
     Raises:
-        ValueError: If a matrix has a wrong shape or is not finite, or `at` is no equilibrium.
+        ValueError: If a matrix has a wrong shape or is not finite, `at` is no equilibrium beside an offset, or A and B
+            are not those of `continuous`.
     """
 
     A: Any
@@ -101,86 +90,71 @@ class Model(ReadOnlyArrays):
         at = (None, None) if self.at is None else self.at
         if not isinstance(at, tuple | list) or len(at) != 2:
             raise ValueError(f"at must be a pair of a state and an input, got {shown(at)}")
-        named = zip(("state", "input"), at, B.shape, strict=True)
-        x, u = (
-            np.zeros(size) if of is None else as_point(of, size, f"the {name} in at=(state, input)")
-            for name, of, size in named
-        )
-        dt = as_number(self.dt, "dt", low=0.0, low_open=True)
-        self._set(at=as_given(self.at), A=A, B=B, H=H, dt=dt, state=x, input=u)
+        for name, of, size in zip(("state", "input"), at, B.shape, strict=True):
+            point = np.zeros(size) if of is None else as_point(of, size, f"the {name} in at=(state, input)")
+            self._set(**{name: point})
+        dt, delays = as_number(self.dt, "dt", low=0.0, low_open=True), _steps(self.delays, B.shape, "delays")
+        self._set(at=as_given(self.at), A=A, B=B, H=H, dt=dt, delays=delays)
         if self.offset is not None:
             self._set(offset=as_vector(self.offset, n, "offset"))
         _ = self.lacking  # which refuses a point that is no equilibrium
         if self.continuous is not None:
-            self._set(continuous=as_matrix(self.continuous, (n, n + B.shape[1]), "continuous"))
-        self._set(delays=_steps(self.delays, B.shape, "delays"))
+            continuous = as_matrix(self.continuous, (n, n + B.shape[1]), "continuous")
+            sampled = zero_order_hold(continuous[:, :n], continuous[:, n:], dt)
+            if not (np.array_equal(sampled[0], A) and np.array_equal(sampled[1], B)):
+                raise ValueError("continuous must be what A and B were sampled from, as by Model.sampled, or None")
+            self._set(continuous=continuous)
 
     @cached_property
     def lacking(self) -> np.ndarray:
         """What `at` lacks of an equilibrium beside an offset, shape (n,); raises ValueError if it is not rounding."""
-        n, c = len(self.A), self.offset
-        if c is None:
-            return np.zeros(n)
-        missing, rests = residual(self.A, self.B, np.eye(n), self.state, self.input, c)
+        if self.offset is None:
+            return np.zeros(len(self.A))
+        missing, rests = residual(self.A, self.B, np.eye(len(self.A)), self.state, self.input, self.offset)
         if not rests:
-            raise ValueError(
-                f"the operating point is no equilibrium: A x0 + B u0 + c - x0 = {shown(missing.tolist())}, not zero; "
-                "leave out offset, which is c of a step, if the model is one of deviations from the operating point"
-            )
+            lacking = f"A x0 + B u0 + c - x0 = {shown(missing.tolist())}"
+            raise ValueError(f"the operating point is no equilibrium: {lacking}; a model of deviations has no offset")
         return missing
 
     @classmethod
     def sampled(cls, A: Any, B: Any, C: Any, dt: float, at: Any = None) -> Self:
         """Returns the exact zero-order hold of x' = A x + B u, y = C x; C is the identity if None."""
         A = _square(A)
-        B = as_matrix(B, (len(A), None), "B")
-        C = None if C is None else as_matrix(C, (None, len(A)), "C")
-        dt = as_number(dt, "dt", low=0.0, low_open=True)
+        B, dt = as_matrix(B, (len(A), None), "B"), as_number(dt, "dt", low=0.0, low_open=True)
         return cls(*zero_order_hold(A, B, dt), C, dt, at, continuous=np.concatenate([A, B], axis=1))
 
     @classmethod
     def of(cls, system: Any, dt: float | None = None, at: Any = None) -> Self:
-        """Returns the model of a state-space model, whose C becomes H.
+        """Returns that of a state-space model, whose C becomes H; one in continuous time is sampled exactly.
 
         Args:
             system: Of python-control or scipy.signal, or a tuple (A, B, C, D) in continuous or (A, B, C, D, dt) in
-                discrete time. A model in continuous time is sampled exactly, by zero-order hold.
+                discrete time.
             dt: Duration of a step [s], needed unless the model has one.
             at: As of `Model`.
 
         Raises:
             ValueError: If it is no such model, D is not zero, or dt is missing or another than the model's.
         """
-        given = (
-            system if isinstance(system, tuple | list) else [getattr(system, name, None) for name in (*"ABCD", "dt")]
-        )
-        A, B, C, D, own = (*given, 0)[:5] if len(given) in (4, 5) else 5 * (None,)
-        if A is None or B is None or C is None:
-            raise ValueError(
-                "the system must be a state-space model of python-control (control.ss(...)) or scipy.signal, whose "
-                f"states limits and names are of, or a tuple (A, B, C, D) or (A, B, C, D, dt), got {shown(system)}"
-            )
-        feedthrough = as_numbers(0.0 if D is None else D)
-        if feedthrough is None or feedthrough.any():
-            raise ValueError(
-                "D of the model must be zero, since sensors here measure y = H x + v: subtract D u, of which u is "
-                f"known, from what is measured and give D = 0, got {shown(D)}"
-            )
+        of = system if isinstance(system, tuple | list) else [getattr(system, name, None) for name in (*"ABCD", "dt")]
+        A, B, C, D, own = (*of, 0)[:5] if len(of) in (4, 5) else 5 * (None,)
         if own is None and type(system).__module__.startswith("scipy."):
             own = 0  # of its models in continuous time
-        if own is None:
+        feedthrough = as_numbers(0.0 if D is None else D)
+        missing = any(each is None for each in (A, B, C, own, feedthrough))
+        if missing or np.any(feedthrough):
             raise ValueError(
-                "the model has dt=None, which does not say whether it is in continuous or discrete time: make it with "
-                "dt=0 or with its sampling time in seconds"
+                "the system must be a state-space model of python-control or scipy.signal, or a tuple (A, B, C, D) or "
+                "(A, B, C, D, dt): D = 0, since sensors here measure H x + v (subtract D u), and dt is 0 in continuous "
+                f"time or the sampling time in seconds, not None, got {shown(system)}"
             )
-        if dt is None and (own is True or own == 0):
-            raise ValueError("the model has no sampling time: give dt, the duration of a step in seconds")
-        dt = as_number(own if dt is None else dt, "dt", low=0.0, low_open=True)
-        if own is not True and own == 0:
-            return cls.sampled(A, B, C, dt, at)
-        if own is not True and abs(as_number(own, "dt of the model", low=0.0) - dt) > SAME_STEP * dt:
-            raise ValueError(f"dt must be that of the model in discrete time, {own}, or be left out, got {dt}")
-        return cls(A, B, C, dt, at)
+        if own is True or own == 0:  # without a sampling time
+            dt = as_number(dt, "dt, the step of a model that has none,", low=0.0, low_open=True)
+            return cls(A, B, C, dt, at) if own is True else cls.sampled(A, B, C, dt, at)
+        own = as_number(own, "dt of the model", low=0.0, low_open=True)
+        if dt is not None and abs(as_number(dt, "dt") - own) > SAME_STEP * own:
+            raise ValueError(f"dt must be that of the model in discrete time, {own:g}, or be left out, got {dt}")
+        return cls(A, B, C, own if dt is None else dt, at)
 
     def held(self, E: Any) -> np.ndarray:
         """Returns what w' = E w held constant over a step does to the state, shape (n, q), for E of shape (n, q).
@@ -189,23 +163,20 @@ class Model(ReadOnlyArrays):
             ValueError: If the model was not sampled from one in continuous time.
         """
         if self.continuous is None:
-            raise ValueError(
-                "what is held over a step is known of a model that Model.sampled made from one in continuous time"
-            )
+            raise ValueError("what is held over a step is known of a model that Model.sampled made")
         n = len(self.A)
         return zero_order_hold(self.continuous[:, :n], as_matrix(E, (n, None), "E"), self.dt)[1]
 
     def with_delays(self, inputs: Any = None, outputs: Any = 0) -> Self:
         """Returns the model of x_i+ = (A x)_i + sum_j B_ij u_j(k - d_ij), y_l = H_l x(k - e_l) + v_l(k).
 
-        Inputs under way become further states of a `LinearPlant`, which knows them: limits and bounds speak of the
-        model's own states alone. Past outputs, each H_l x, the newest first, become the last of the model's own states:
-        limits and bounds speak of them too, with no limit, no disturbance, and the error of a first estimate.
+        Inputs under way become further states of a `LinearPlant`, of which limits and bounds do not speak. Past
+        outputs, each H_l x, the newest first, become the last of the model's own states: with no limit, no disturbance,
+        and the error of a first estimate.
 
         Args:
-            inputs: d, whole steps: a number, one for each input, shape (m,), or for each state and input, shape (n, m),
-                as of a matrix of lags with dead times; None for what they are.
-            outputs: e, whole steps: a number, or one for each output, shape (p,).
+            inputs: d, whole steps: a number, shape (m,), or for each state and input, shape (n, m); None keeps them.
+            outputs: e, whole steps: a number, or shape (p,).
 
         Raises:
             ValueError: If they are no such steps.
@@ -234,7 +205,6 @@ def _square(A: Any) -> np.ndarray:
 
 
 def _steps(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Returns whole steps of the given shape; raises ValueError if they are none."""
     steps, shapes = as_setting(value), [*dict.fromkeys((shape[-1:], shape))]
     if steps is None or steps.shape not in ((), *shapes) or not np.isin(steps, np.arange(LONGEST_DELAY + 1)).all():
         one = f"{name} must be a whole number of steps from 0 to {LONGEST_DELAY}"

@@ -21,11 +21,7 @@ LARGEST_LOG, MOST_PACKETS, MOST_STEPS = 256 << 20, 2_000_000, 10_000_000
 
 
 def read_file(path: str | os.PathLike[str], most: int = LARGEST_DOCUMENT) -> bytes:
-    """Returns the bytes of a regular file, or of one that a link leads to.
-
-    Raises:
-        OSError: If it cannot be read, is a folder, a pipe or a device, or has more than so many bytes.
-    """
+    """Returns the bytes of a regular file; raises OSError if it is none, or has more than so many."""
     with open_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
@@ -34,11 +30,7 @@ def read_file(path: str | os.PathLike[str], most: int = LARGEST_DOCUMENT) -> byt
 
 
 def open_file(path: str | os.PathLike[str]) -> BinaryIO:
-    """Returns a regular file, or one that a link leads to, open for reading.
-
-    Raises:
-        OSError: If it cannot be read, or is a folder, a pipe or a device.
-    """
+    """Returns a regular file, or one that a link leads to, open for reading; raises OSError if it is none."""
     file = open(os.fspath(path), "rb", opener=_opened)  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
@@ -47,27 +39,17 @@ def open_file(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def _opened(path: str, flags: int) -> int:
-    """Opens a file without waiting for whoever writes into it if it is a pipe."""
+    """Opens a file without waiting for who writes into it if it is a pipe."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def read_text(path: str | os.PathLike[str]) -> str:
-    """Returns the text of a file in UTF-8, as `read_file` its bytes.
-
-    Raises:
-        OSError: As from `read_file`.
-        UnicodeDecodeError: If it is no such text.
-    """
+    """Returns the text of a file as `read_file` its bytes; raises UnicodeDecodeError if it is not UTF-8."""
     return read_file(path).decode("utf-8").replace("\r\n", "\n")
 
 
 def json_values(text: str | bytes, **keywords: Any) -> Any:
-    """Returns the values of a JSON text, as `json.loads` does.
-
-    Raises:
-        ValueError: If it is none, or has more than `MOST_VALUES` values.
-        RecursionError: If its lists are too deep.
-    """
+    """Returns the values of a JSON text, as `json.loads` does; raises ValueError if it has more than `MOST_VALUES`."""
     marks: Any = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
     if sum(text.count(mark) for mark in marks) > MOST_VALUES:
         raise ValueError(f"it has more than {MOST_VALUES:,} values")

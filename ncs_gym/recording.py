@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from textwrap import fill
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 
 from ncs_gym.bounds import Bounds, Box, Through
 from ncs_gym.model import Model
+from ncs_gym.plants.description import of_outputs
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_names, as_number, as_setting, counted, shown
 
 # A record has at least so many windows, half of which are held against the other half.
@@ -19,15 +20,13 @@ FEWEST_WINDOWS = 20
 _RANK_PRECISION = 1e-10
 # Results of linear programs are moved outward by this fraction of their units, ten times the solver's tolerance.
 _PRECISION = 1e-6
-# Residuals grow with a signal if Student's t of the slope is above the first number, and if they change over the
-# signal's range by more than the second, in units of their mean.
+# Residuals grow with a signal if Student's t of the slope, and their change over its range in means, are above these.
 _LEAST_T, _LEAST_GROWTH = 5.0, 0.5
-# Combinations of outputs are sought that let through little of other steps of the same direction and of other ones,
-# which count as so many of their units: the best of what these say is kept.
+# What other steps of the same direction, and other ones, count in combinations of outputs, of which the best is kept.
 _MULTIPLES = ((1.0, 1.0), (10.0, 1.0), (100.0, 1.0), (100.0, 100.0))
-# Steps of the parts of a record that each give a lower bound, so that the time for it is proportional to its length.
+# Steps of the parts of a record that each give a lower bound.
 _PART = 200
-# A window of outputs has so many further steps at both ends, which leave less of other disturbances.
+# Further steps of a window of outputs at both ends, which leave less of other disturbances.
 _FURTHER = 2
 
 
@@ -41,15 +40,13 @@ class RecordedBounds(ReadOnlyArrays):
         steps: Number of steps of the record.
         window: Number of steps from whose outputs one disturbance is told: 1 where states are measured.
         lower: No smaller half-width of a direction explains every sample, however large the others are, shape (q,).
-        explaining: Of all half-widths that together explain every sample those of the smallest weighted sum, shape
-            (q,): at least this sum occurred.
-        upper: No larger disturbance occurred, shape (q,); infinite where the outputs do not tell. With a window of
-            several steps this takes for granted that none was larger closer to an end of the record than that.
+        explaining: Those that together explain every sample with the smallest weighted sum, shape (q,).
+        upper: No larger disturbance occurred, shape (q,), unless closer to an end of the record than the window;
+            infinite where the outputs do not tell.
         sensor: Half-widths of the sensor noise that all these take for granted, shape (p,).
         left: Share of the second half's steps whose disturbance may exceed all of the first half's, shape (q,).
         grows: Sentences, where disturbances grow with a state or an input: the model is wrong, not the bound.
-        first_error: Half-widths of the error of a state that is read off one sample, shape (n,); infinite where one
-            sample does not tell.
+        first_error: Half-widths of the error of a state read off one sample, shape (n,); infinite where that is none.
     """
 
     E: np.ndarray
@@ -69,12 +66,12 @@ class RecordedBounds(ReadOnlyArrays):
         self._make_arrays_read_only()
 
     def bounds(self, factor: float, *, of: str = "upper", first_error: Any = None) -> Bounds:
-        """Returns bounds of a plant: half-widths found here, times a factor that you declare; sensor noise as it was.
+        """Returns bounds of a plant: half-widths found here, times a factor, >= 1, that you declare.
 
         Args:
-            factor: At least 1.
+            factor: That of disturbances.
             of: "upper", or "explaining" where outputs leave no upper bound.
-            first_error: As of `Bounds`; by default that of a state that is read off one sample, `first_error`.
+            first_error: As of `Bounds`; by default `first_error`.
 
         Raises:
             ValueError: If the factor is below 1, a direction has no upper bound, or one sample does not tell the state.
@@ -85,10 +82,8 @@ class RecordedBounds(ReadOnlyArrays):
         half = factor * getattr(self, of)
         if not np.isfinite(half).all():
             name = self.directions[int(np.argmin(np.isfinite(half)))]
-            raise ValueError(
-                f"these outputs leave no upper bound of {name}: measure more, give fewer directions, or declare a "
-                'multiple of what explains the record, of="explaining" (--of explaining)'
-            )
+            advice = 'measure more, give fewer directions, or take of="explaining" (--of explaining)'
+            raise ValueError(f"these outputs leave no upper bound of {name}: {advice}")
         if first_error is None:
             if not np.isfinite(self.first_error).all():
                 raise ValueError("one sample of these outputs does not tell the state: give first_error")
@@ -143,13 +138,12 @@ def bounds_from_recording(
 
     Args:
         model: The equations.
-        inputs: Of each step, shape (N, m), in the model's own units as the outputs; they act after its delays.
+        inputs: Of each step, shape (N, m), in the model's own units as the outputs.
         outputs: Sampled before the input, shape (N + 1, p), or (N, p), where the last input is not used.
         E: Directions of the disturbance, shape (n, q); the identity if None.
         sensor: Half-widths of sensor noise, a number or shape (p,), as of a data sheet.
-        weights: Of the half-widths in `explaining`, shape (q,); by default the inverse of what each would be if it
-            explained the record alone.
-        labels: Names of states and inputs for people, as of `LinearPlant`.
+        weights: Of `explaining`, shape (q,); by default the inverse of what each would be if it explained the record.
+        labels: As of `LinearPlant`.
 
     Raises:
         ValueError: If shapes do not fit, a value is not finite, the record is too short, the outputs do not tell the
@@ -184,7 +178,7 @@ def bounds_from_recording(
     may_leave = np.abs(found[half:]) > (1.0 + _PRECISION) * np.abs(found[:half]).max(axis=0)
     one = np.linalg.pinv(H) if record.window == 1 else np.full((n, p), np.inf)
     directions = names["states"] if is_identity else [f"E{i + 1}" for i in range(E.shape[1])]
-    measured = output_names(H, names["states"])
+    measured = of_outputs(H, names["states"])
     signals = [*measured, *names["inputs"]]
     return RecordedBounds(
         E=E,
@@ -205,12 +199,6 @@ def bounds_from_recording(
         ),
         first_error=np.abs(one) @ phi if record.window == 1 else np.full(n, np.inf),
     )
-
-
-def output_names(H: np.ndarray, states: Sequence[str]) -> list[str]:
-    """Returns names of outputs: that of a state that is measured alone, else y1, y2, ..."""
-    alone = (np.abs(H).sum(axis=1) == 1.0) & (H.max(axis=1) == 1.0)
-    return [str(states[row.argmax()]) if alone[j] else f"y{j + 1}" for j, row in enumerate(H)]
 
 
 class _Record:
@@ -245,7 +233,7 @@ class _Record:
         self.s_unit = (largest or 1.0) / np.linalg.norm(of_one, axis=0)
 
     def of_state(self, steps: int) -> np.ndarray:
-        """Returns what a state does to the outputs from then on, O of shape ((steps + 1) p, n)."""
+        """Returns what a state does to the outputs, O of shape ((steps + 1) p, n)."""
         return np.concatenate([self.model.H @ np.linalg.matrix_power(self.model.A, j) for j in range(steps + 1)])
 
     def of_disturbance(self, steps: int) -> np.ndarray:
@@ -257,7 +245,7 @@ class _Record:
         return found
 
     def windows(self, steps: int) -> np.ndarray:
-        """Returns the outputs of windows of so many steps without what inputs did, shape (windows, (steps + 1) p)."""
+        """Returns the outputs of windows without what inputs did, shape (windows, (steps + 1) p)."""
         count = len(self.u) - steps + 1
         seen, moved = [self.y[:count]], np.zeros((count, len(self.E)))
         for j in range(steps):
@@ -285,8 +273,8 @@ class _Record:
     def _least(self, kept: list[int], cost: np.ndarray, phi: np.ndarray, part: slice = slice(None)) -> np.ndarray:
         """Returns the half-widths, in units, of the directions that are kept.
 
-        The variables, in units, are v of each sample, s of each step, and the half-widths. The first nu samples of the
-        part tell a state, if what is `beside` vanishes, and every further one is what the nu before it predict.
+        Variables are v of each sample, s of each step, and the half-widths. The first nu samples of the part tell a
+        state, if what is `beside` vanishes, and every further one is what the nu before it predict.
         """
         from scipy.optimize import linprog  # takes long to import
         from scipy.sparse import block_array, csr_array, eye_array, hstack, kron, vstack
@@ -320,14 +308,12 @@ class _Record:
             if found.status == 0:
                 return found.x[-count:]
             if found.status == 2:
-                raise ValueError(
-                    "no disturbance along E and no sensor noise within its half-widths explain the record: give more "
-                    "directions or larger half-widths"
-                )
+                nothing = "no disturbance along E and no sensor noise within its half-widths explain the record"
+                raise ValueError(f"{nothing}: give more directions or larger half-widths")
         raise ValueError(f"the linear program of the record was not solved, take another part of it: {found.message}")
 
     def upper(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns upper bounds (q,), what combinations say of s in each window, and their shares of noise (q,)."""
+        """Returns upper bounds, what combinations say of s in each window, and their shares of noise."""
         from scipy.optimize import linprog
 
         q, flat = len(self.s_unit), self.windows(self.window)
@@ -375,10 +361,7 @@ class _Record:
         return z / (z @ through[own]) @ beside * self.s_unit[i] / flat
 
     def growths(self, found: np.ndarray, noise: np.ndarray) -> list[tuple[float, float, int]]:
-        """Returns for each direction t, change and number of the output or input whose size it grows with the most.
-
-        What noise may have done to a disturbance does not count.
-        """
+        """Returns for each direction t, change and number of the output or input whose size it grows with the most."""
         seen = slice(self.window // 2, self.window // 2 + len(found))
         sizes = np.concatenate([np.abs(self.y[seen]), np.abs(self.u[seen])], axis=1)
         certain = np.maximum(np.abs(found) - noise, 0.0)
@@ -386,7 +369,7 @@ class _Record:
 
 
 def _slope(values: np.ndarray, sizes: np.ndarray) -> tuple[float, float]:
-    """Returns Student's t of the slope of values over sizes, and how much it is over their range in units of the mean.
+    """Returns Student's t of the slope of values over sizes, and what that is over their range in means.
 
     Autocorrelated steps count as fewer independent ones (Bartlett).
     """

@@ -12,11 +12,7 @@ import numpy as np
 
 
 def begun_many(shared: Any, rng: np.random.Generator, plant: Any, count: int) -> np.ndarray:
-    """Returns what `begin` of a task or a disturbance draws for `count` episodes, along the last axis.
-
-    Raises:
-        ValueError: If it stores something in the object.
-    """
+    """Returns what `begin` of a task or a disturbance draws for `count` episodes, along the last axis."""
     with storing_nothing(shared):
         if shared.vectorized:
             return shared.begin(rng, plant, count)
@@ -28,18 +24,14 @@ def begun_many(shared: Any, rng: np.random.Generator, plant: Any, count: int) ->
 
 @contextmanager
 def storing_nothing(shared: Any) -> Iterator[None]:
-    """Runs code of others with an object that many environments share.
-
-    Raises:
-        ValueError: If it stores something in the object, which the next environment would read.
-    """
+    """Raises ValueError if code of others stores something in an object that many environments share."""
     before = _stored(shared)
     yield
     for name, (value, image) in _stored(shared).items():
         if name not in before or before[name][0] is not value or before[name][1] != image:
             raise ValueError(
                 f"{type(shared).__name__} stores {name!r} in itself, which all environments of a vector share: keep it "
-                "in what begin returns, which each episode has for itself"
+                "in what begin returns"
             )
 
 

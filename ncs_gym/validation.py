@@ -17,8 +17,8 @@ LARGEST_NUMBER, SMALLEST_NUMBER = 1e75, 1e-75
 LARGEST_COUNT = 2**31 - 1
 # Messages quote no more of a value than this many letters, and names and phrases of plants have no more.
 MAX_QUOTED_LENGTH, LONGEST_TEXT = 200, 1000
-# What a covariance may lack of a symmetric, positive semidefinite one, in units of its deviations: a few roundings of
-# float32 in each of some ten entries. What an eigenvalue lacks by rounding of float64 alone is no reason to change it.
+# What a covariance may lack of a symmetric, positive semidefinite one, in units of its deviations: roundings of
+# float32; what an eigenvalue lacks by rounding of float64 alone is no reason to change it.
 COVARIANCE_ROUNDING, EIGENVALUE_ROUNDING = 1e-6, 1e-12
 # Default of a field that `__post_init__` puts a value in place of: None, but never seen as that from outside.
 FILLED_IN_LATER: Any = None
@@ -39,9 +39,8 @@ def warn_caller(text: str, category: type[Warning]) -> None:
 class ReadOnlyArrays:
     """Mixin that keeps the array fields of a frozen dataclass read-only.
 
-    `dataclass(frozen=True)` stops assignment to a field but not writing into an array. `gym.make`
-    deep-copies keyword arguments, and both copies and pickles of a read-only array are writable
-    again; so a copy is the object itself, and unpickling freezes anew.
+    Copies, as `gym.make` makes of keyword arguments, and pickles of a read-only array are writable again; so a copy is
+    the object itself, and unpickling freezes anew.
     """
 
     def _make_arrays_read_only(self) -> None:
@@ -65,35 +64,29 @@ class ReadOnlyArrays:
 
 
 class CopiedWhole:
-    """Mixin for what changes from step to step: no copy shares anything with it, shallow copies neither."""
+    """Mixin for what changes from step to step: shallow copies share nothing with it either."""
 
     def __copy__(self) -> Self:
         return copy.deepcopy(self)
 
 
 def setting(name: str, kept_as: str | None = None) -> Any:
-    """Returns a read-only property.
-
-    Args:
-        name: Of the property.
-        kept_as: Attribute that holds the value, also of a part ("part.attribute"); the name after an underscore by
-            default.
-    """
+    """Returns a read-only property of an attribute, also of a part ("part.attribute"); by default `_name`."""
     return property(attrgetter(kept_as or f"_{name}"))
 
 
 class AroundEnvironments:
     """Mixin of wrappers of vector environments: their specification says that they are there, as single ones' does.
 
-    Gymnasium's vector wrappers leave themselves out, so that `gym.make_vec` would make environments without a shield or
-    a network of it. With this it is refused: vector wrappers are put around what `make_vec` makes.
+    Gymnasium's leave themselves out, so that `gym.make_vec` would make environments without a shield or a network of
+    it, which is refused with this.
     """
 
     env: Any
 
     @property
     def spec(self) -> Any:
-        """Specification of the environments, with the wrappers around them; a copy, or None where there is none."""
+        """A copy of the specification, with the wrappers around; None where there is none."""
         from gymnasium.envs.registration import WrapperSpec
 
         if (inside := self.env.spec) is None:
@@ -107,9 +100,7 @@ class AroundEnvironments:
 
 def read_only(array: np.ndarray) -> np.ndarray:
     """Returns a read-only copy of `array`."""
-    frozen = array.copy()
-    frozen.setflags(write=False)
-    return frozen
+    return frozen(array.copy())
 
 
 def frozen_inside(value: Any) -> Any:
@@ -120,10 +111,7 @@ def frozen_inside(value: Any) -> Any:
 
 
 def as_given(value: Any) -> Any:
-    """Returns a setting of numbers as it was given, which nothing changes any more: lists as tuples, others as arrays.
-
-    What is no setting of numbers stays as it is, for whoever refuses it.
-    """
+    """Returns a setting of numbers as it was given, frozen: lists as tuples, others as arrays."""
     if isinstance(value, list | tuple):
         return tuple(map(as_given, value))
     numbers = None if isinstance(value, bool | int | float | None) else as_setting(value)
@@ -131,34 +119,25 @@ def as_given(value: Any) -> Any:
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
-    """Returns the array itself, which nobody may write to any more."""
+    """Returns the array itself, made read-only."""
     array.setflags(write=False)
     return array
 
 
 def guarded(array: np.ndarray) -> np.ndarray:
-    """Returns a view of an array for code of others, which cannot write into it."""
-    view = array.view()
-    view.setflags(write=False)
-    return view
+    """Returns a read-only view of an array for code of others."""
+    return frozen(array.view())
 
 
 def require_batched_infos(info: Any, outside: str) -> None:
-    """Raises ValueError unless the infos of a vector environment are a dictionary of arrays, as wrappers outside need.
-
-    Args:
-        info: The infos.
-        outside: The wrapper that reads them, for the message.
-    """
+    """Raises ValueError unless the infos of a vector environment are a dictionary, as the wrapper outside needs."""
     if not isinstance(info, dict):
-        raise ValueError(
-            f"{outside} reads a dictionary of arrays as infos, and a wrapper inside makes a {type(info).__name__} "
-            f"of them: put it (DictInfoToList, say) outside of {outside}"
-        )
+        text = f"{outside} reads infos as a dictionary, and a wrapper inside makes a list of them"
+        raise ValueError(f"{text}: put it outside of {outside}")
 
 
 def printable(text: str) -> str:
-    """Returns a text that means nothing to a terminal: characters that are not printed are escaped."""
+    """Returns a text whose characters that are not printed are escaped."""
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
@@ -168,7 +147,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def as_numbers(value: Any) -> np.ndarray | None:
-    """Returns `value` as a float64 array; None for what is not real numbers, whatever it raises when asked."""
+    """Returns `value` as a float64 array; None for what is not real numbers."""
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
@@ -182,33 +161,31 @@ def as_numbers(value: Any) -> np.ndarray | None:
 
 
 def shown(value: Any) -> str:
-    """Returns a value as messages quote it: on one line, and not without end; a path as it is."""
+    """Returns a value, or a path as it is, as messages quote it: on one line, and not without end."""
     try:
-        text = " ".join((str(value) if isinstance(value, PurePath) else repr(value)).split())
+        return _quoted(str(value) if isinstance(value, PurePath) else repr(value))
     except Exception:
-        text = f"a {type(value).__name__}"
-    return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
+        return f"a {type(value).__name__}"
 
 
 def reason_of(error: BaseException) -> str:
-    """Returns what an error says, as messages quote it: on one line, not without end; its type if it says nothing."""
-    text = " ".join(str(error)[: 2 * MAX_QUOTED_LENGTH].split()).rstrip(".") or type(error).__name__
+    """Returns what an error says, as messages quote it; its type if it says nothing."""
+    return _quoted(str(error)[: 2 * MAX_QUOTED_LENGTH]).rstrip(".") or type(error).__name__
+
+
+def _quoted(text: str) -> str:
+    text = " ".join(text.split())
     return text if len(text) <= MAX_QUOTED_LENGTH else f"{text[:MAX_QUOTED_LENGTH]}..."
 
 
 def as_setting(value: Any) -> np.ndarray | None:
-    """Returns a new float64 array; None for what is not real numbers: text, truth values, complex or masked ones."""
+    """Returns a new float64 array; None for text, truth values, complex or masked numbers."""
     numbers = as_numbers(value)
     return None if numbers is None or np.asarray(value).dtype.kind == "b" else np.array(numbers)
 
 
 def as_matrix(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
-    """Returns `value` as a finite float64 matrix, or a vector, of the expected shape.
-
-    Args:
-        value: Anything numpy can turn into an array.
-        shape: Expected (rows, columns), or (entries,); None accepts any positive number.
-        name: What the error message calls it.
+    """Returns `value` as a finite float64 matrix or vector of a shape, in which None stands for any positive number.
 
     Raises:
         ValueError: If it is not numeric, has another shape, or holds a NaN or an infinity.
@@ -227,18 +204,17 @@ def as_matrix(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarra
 
 
 def as_vector(value: Any, size: int | None, name: str) -> np.ndarray:
-    """Returns `value` as a finite float64 vector of the expected size (None: any); for errors see `as_matrix`."""
+    """Returns `as_matrix` of a vector of the expected size (None: any)."""
     return as_matrix(value, (size,), name)
 
 
 def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
     """Returns `value` as a symmetric positive semidefinite (size, size) matrix (None: of any size).
 
-    What it lacks of one may be rounding, in units of its own deviations: such a matrix is given a little more variance.
+    One that lacks that by rounding, in units of its own deviations, is given a little more variance.
 
     Raises:
-        ValueError: If it has another shape, is not finite, not symmetric or has a negative
-            eigenvalue beyond rounding.
+        ValueError: If it is none.
     """
     matrix = as_matrix(value, (size, size), name)
     if size is None:
@@ -267,20 +243,14 @@ def as_number(
     low_open: bool = False,
     high_open: bool = False,
 ) -> float:
-    """Returns `value` as a finite float inside an interval.
-
-    Raises:
-        ValueError: If it is not a finite real number or lies outside the interval.
-    """
+    """Returns `value` as a finite float inside an interval, or raises ValueError."""
     wanted = f"{'>' if low_open else '>='} {low:g}" if np.isfinite(low) else "finite"
     wanted += f" and {'<' if high_open else '<='} {high:g}" if np.isfinite(high) else ""
     try:
         single = as_setting(float(value) if type(value) is int else value)  # numpy knows no longer ones
     except OverflowError:
         single = None
-    if single is None or single.ndim:
-        raise ValueError(f"{name} must be a number {wanted}, got {shown(value)}")
-    number = float(single)
+    number = np.nan if single is None or single.ndim else float(single)
     above = number > low if low_open else number >= low
     below = number < high if high_open else number <= high
     if not (np.isfinite(number) and above and below):
@@ -292,11 +262,7 @@ def as_number(
 
 
 def as_names(value: Any, default: tuple[str, ...], name: str) -> tuple[str, ...]:
-    """Returns texts as a tuple of the length of `default`, which stands for none at all.
-
-    Raises:
-        ValueError: If it is no sequence of texts, or of another length, or `require_short_text` raises it.
-    """
+    """Returns short texts as a tuple of the length of `default`, which stands for none at all, or raises ValueError."""
     if not isinstance(value, (list, tuple)) or not all(isinstance(each, str) for each in value):
         raise ValueError(f"{name} must be a list of texts, got {shown(value)}")
     for each in value:
@@ -307,28 +273,20 @@ def as_names(value: Any, default: tuple[str, ...], name: str) -> tuple[str, ...]
 
 
 def require_short_text(text: str, name: str) -> None:
-    """Raises ValueError unless a text has at most `LONGEST_TEXT` letters, which a terminal prints as they are."""
+    """Raises ValueError unless a text is printable and has at most `LONGEST_TEXT` letters."""
     if len(text) > LONGEST_TEXT or not text.isprintable():
         raise ValueError(f"{name} must be printable text of at most {LONGEST_TEXT} letters, got {shown(text)}")
 
 
 def as_flag(value: Any, name: str) -> bool:
-    """Returns `value` if it is a bool.
-
-    Raises:
-        ValueError: If it is anything else.
-    """
+    """Returns `value` if it is a bool, or raises ValueError."""
     if not isinstance(value, (bool, np.bool_)):
         raise ValueError(f"{name} must be True or False, got {shown(value)}")
     return bool(value)
 
 
 def as_count(value: Any, name: str, *, low: int, high: int = LARGEST_COUNT) -> int:
-    """Returns `value` as an int of at least `low` and at most `high`.
-
-    Raises:
-        ValueError: If it is not a whole number (a bool is not one) or out of range.
-    """
+    """Returns a whole number from `low` to `high`, which a bool is not, or raises ValueError."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < low:
         raise ValueError(f"{name} must be a whole number >= {low}, got {shown(value)}")
     if value > high:

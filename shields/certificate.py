@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import ChannelContract, Ellipsoid
+from ncs_gym.reading import read_text
 from ncs_gym.validation import FILLED_IN_LATER, ReadOnlyArrays, as_matrix, as_setting, as_vector, read_only, shown
 from shields.certificate_text import (
     contract_text,
@@ -22,7 +23,7 @@ from shields.certificate_text import (
     table,
 )
 from shields.errors import CertificateError
-from shields.json_documents import content_of, document_of, read_content, write_document
+from shields.json_documents import content_of, document_of, write_document
 from shields.polytope import Polytope, polytope_content, polytope_of
 
 _FORMAT = "ncs-gym certificate 3"
@@ -30,41 +31,16 @@ _FORMAT = "ncs-gym certificate 3"
 _DUST = 1e-9
 
 
-@dataclass(frozen=True, kw_only=True)
-class Multipliers:
-    """The S-procedure multipliers of the conditions of docs/shield_proof.md, all without unit.
-
-    Attributes:
-        error: Multiplier lam_e of the error set's condition (E1), in (0, 1).
-        state: Multiplier lx of the state in the invariance condition (I), > 0.
-        estimate: Multiplier le of the estimation error in (I), > 0.
-        disturbance: Multiplier ld of the disturbance in (I), > 0; lx + le + ld <= 1.
-        inputs: Multipliers mu_i of the input limits (U), one per input, in (0, 1).
-        rounding: Multiplier s of D_u, the disturbance set enlarged by the rounding of actions to float32, > 0.
-
-    Those of (I) and (U) are None where the polytope alone is invariant.
-    """
-
-    error: float
-    rounding: float
-    state: float | None = None
-    estimate: float | None = None
-    disturbance: float | None = None
-    inputs: tuple[float, ...] | None = None
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Proof(ReadOnlyArrays):
     """Why u = K x_hat keeps the state in S, and the input within its limits, for every estimation error in one set.
 
-    Under a channel contract there is one for every age of the newest sample, without one a single proof.
-
     Attributes:
         Sigma: Shape of the error set, (n, n).
-        rate: Multiplier lam of (E1), under a contract of (C1): without a sample the error is in the next set.
-        shares: Multipliers lx, le, ld of state, estimation error and disturbance in (I), shape (3,); None if the state
-            is kept in the certificate's polytope alone, whose multipliers are those of (P) and (PU).
-        inputs: Multipliers mu_i of the input limits (U), shape (m,); None with `shares`.
+        rate: Multiplier lam of (E1), in (0, 1), under a contract of (C1): with no sample the error is in the next set.
+        shares: Multipliers lx, le, ld > 0 of state, estimation error and disturbance in (I), at most 1 together, shape
+            (3,); None if the state is kept in the certificate's polytope alone, whose multipliers are of (P) and (PU).
+        inputs: Multipliers mu_i in (0, 1) of the input limits (U), shape (m,); None with `shares`.
     """
 
     Sigma: np.ndarray
@@ -73,18 +49,16 @@ class Proof(ReadOnlyArrays):
     inputs: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        """Raises CertificateError if a field is of the wrong kind; the ranges of multipliers are verified."""
         try:
-            object.__setattr__(self, "Sigma", as_matrix(self.Sigma, (None, None), "Sigma"))
-            object.__setattr__(self, "rate", float(_as_array(self.rate, (), "the rate of an error set")))
+            rate = float(_as_array(self.rate, (), "the rate of an error set"))
+            self._set(Sigma=as_matrix(self.Sigma, (None, None), "Sigma"), rate=rate)
             if (self.shares is None) != (self.inputs is None):
                 raise ValueError("the multipliers of (I) and (U) must both be given, or neither")
             if self.shares is not None:
-                object.__setattr__(self, "shares", _as_array(self.shares, (3,), "the multipliers of (I)"))
-                object.__setattr__(self, "inputs", _as_array(self.inputs, (None,), "the multipliers of (U)"))
+                shares = _as_array(self.shares, (3,), "the multipliers of (I)")
+                self._set(shares=shares, inputs=_as_array(self.inputs, (None,), "the multipliers of (U)"))
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
-        self._make_arrays_read_only()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -106,7 +80,6 @@ class Updates(ReadOnlyArrays):
     noise: np.ndarray
 
     def __post_init__(self) -> None:
-        """Raises CertificateError if the shapes are inconsistent or a number is not finite."""
         try:
             if not isinstance(self.contract, ChannelContract):
                 raise ValueError("its contract is no ChannelContract")
@@ -118,9 +91,7 @@ class Updates(ReadOnlyArrays):
                 raise ValueError("its gains must be finite")
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
-        for name, array in (arrays | {"last": last, "noise": noise}).items():
-            object.__setattr__(self, name, array)
-        self._make_arrays_read_only()
+        self._set(**arrays, last=last, noise=noise)
 
 
 class Fallback(NamedTuple):
@@ -146,37 +117,29 @@ class Fallback(NamedTuple):
         """u_c - K x_c, shape (m,), which K x_hat is added to."""
         return self.resting_input - self.gain @ self.resting_state
 
-    def with_gain(self, gain: np.ndarray) -> Fallback:
-        """Returns the input of another gain around the same point."""
-        return self._replace(gain=gain)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate(ReadOnlyArrays):
     """A robust control invariant set S inside the safe box, its gain, and the numbers that prove it.
 
-    It may also have a polytope around E(L) that the same gain keeps invariant, which is S then (`safe_set`). Where
-    the gain keeps a polytope but no ellipsoid, that is all that is proved, and E(L) around `resting_state` is merely an
-    ellipsoid inside (`keeps_ellipsoid`).
-
-    A certificate is not trusted until `shields.verify` has checked it in exact arithmetic. Two certificates are equal
-    if their files are, every digit of them. `print(certificate)` says what it is for.
+    S is the polytope if there is one, else E(L). Where the gain keeps a polytope but no ellipsoid, E(L) around
+    `resting_state` is merely an ellipsoid inside (`keeps_ellipsoid`). A certificate is not trusted until
+    `shields.verify` has checked it in exact arithmetic. Two are equal if their files are, in every digit.
 
     Attributes:
         L: Shape of the ellipsoid E(L), (n, n) [squares of the states' units].
         K: Gain of the fallback input, shape (m, n) [input per state].
-        proofs: One for each error set: under a channel contract for the ages 0..h of the newest sample, otherwise a
-            single one.
+        proofs: Under a channel contract one for each age 0..h of the newest sample, otherwise a single one.
         D: Shape of the disturbance set that the proofs assume, (n, n).
-        rounding: Multiplier s of D_u, which is D enlarged by the rounding of actions to float32.
+        rounding: Multiplier s > 0 of D_u, which is D enlarged by the rounding of actions to float32.
         updates: What a channel contract adds to the proofs; None without a contract.
-        polytope: The polytope that a shield keeps in place of S; None without one.
-        resting_state: x_c of the fallback input u = u_c + K (x_hat - x_c), shape (n,), around which its sets are: an
-            equilibrium without estimation error and disturbance; zero, the plant's operating point, by default.
+        polytope: Around `resting_state`, invariant under the same gain; None without one.
+        resting_state: x_c of the fallback input u = u_c + K (x_hat - x_c), shape (n,): an equilibrium without
+            estimation error and disturbance; zero, the plant's operating point, by default.
         resting_input: u_c, shape (m,).
-        between_samples: The plant's: the state is claimed to be in the box at all times if it is given, None claims it
-            at the sampling instants.
-        fingerprint: Fingerprint of the plant that the certificate belongs to.
+        between_samples: The plant's: with it the state is claimed to be in the box at all times, None claims it at the
+            sampling instants.
+        fingerprint: That of the plant.
         provenance: How the certificate was made (solver, versions, volume); it proves nothing.
     """
 
@@ -194,25 +157,20 @@ class Certificate(ReadOnlyArrays):
     provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Raises CertificateError if a field is of the wrong kind."""
         try:
             self._check_fields()
-            L = as_matrix(self.L, (None, None), "L")
-            n = len(L)
-            object.__setattr__(self, "L", as_matrix(L, (n, n), "L"))
-            object.__setattr__(self, "K", as_matrix(self.K, (None, n), "K"))
-            object.__setattr__(self, "D", as_matrix(self.D, (n, n), "D"))
-            object.__setattr__(self, "rounding", float(_as_array(self.rounding, (), "rounding")))
+            n = len(as_matrix(self.L, (None, None), "L"))
+            self._set(L=as_matrix(self.L, (n, n), "L"), K=as_matrix(self.K, (None, n), "K"))
+            self._set(D=as_matrix(self.D, (n, n), "D"), rounding=float(_as_array(self.rounding, (), "rounding")))
             for name, size in (("resting_state", n), ("resting_input", len(self.K))):
                 value = getattr(self, name)
-                object.__setattr__(self, name, np.zeros(size) if value is None else as_vector(value, size, name))
+                self._set(**{name: np.zeros(size) if value is None else as_vector(value, size, name)})
+            self._set(proofs=tuple(self.proofs))
             self._check_error_sets(n)
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
-        self._make_arrays_read_only()
 
     def _check_fields(self) -> None:
-        """Raises ValueError unless the fields that are no arrays are of their kinds."""
         if not (isinstance(self.provenance, dict) and isinstance(self.fingerprint, str)):
             raise ValueError("its provenance must be a dict, and its fingerprint a text")
         for name, kind in (("updates", Updates), ("polytope", Polytope), ("between_samples", int)):
@@ -222,7 +180,6 @@ class Certificate(ReadOnlyArrays):
 
     def _check_error_sets(self, n: int) -> None:
         """Raises ValueError unless there is a proof for every age, and all error sets have n dimensions."""
-        object.__setattr__(self, "proofs", tuple(self.proofs))
         ages = 1 if self.updates is None else self.updates.contract.max_age + 1
         if len(self.proofs) != ages:
             raise ValueError(f"it must have {ages} proofs, one per error set, got {len(self.proofs)}")
@@ -249,17 +206,17 @@ class Certificate(ReadOnlyArrays):
 
     @cached_property
     def ellipsoid(self) -> Ellipsoid:
-        """The ellipsoid E(L), of deviations from `resting_state`; invariant itself if `keeps_ellipsoid`."""
+        """E(L), of deviations from `resting_state`."""
         return Ellipsoid(self.L)
 
     @property
     def keeps_ellipsoid(self) -> bool:
-        """Whether E(L) is claimed to be invariant; otherwise the polytope alone is, and x_c + E(L) lies inside it."""
+        """Whether E(L) is claimed to be invariant; otherwise the polytope alone is."""
         return all(proof.shares is not None for proof in self.proofs)
 
     @property
     def safe_set(self) -> Ellipsoid | Polytope:
-        """S, the set that a shield keeps: the polytope if there is one, else the ellipsoid E(L)."""
+        """S, the set that a shield keeps."""
         return self.ellipsoid if self.polytope is None else self.polytope
 
     @property
@@ -269,24 +226,8 @@ class Certificate(ReadOnlyArrays):
 
     @property
     def Sigma(self) -> np.ndarray:
-        """Shape of the error set, (n, n), under a contract that of the largest age."""
+        """Shape of the error set, (n, n); under a contract that of the largest age."""
         return self.proofs[-1].Sigma
-
-    @property
-    def multipliers(self) -> Multipliers:
-        """The multipliers of the proof, under a contract those of the largest age."""
-        last = self.proofs[-1]
-        if last.shares is None or last.inputs is None:
-            return Multipliers(error=last.rate, rounding=self.rounding)
-        lx, le, ld = last.shares.tolist()
-        return Multipliers(
-            error=last.rate,
-            state=lx,
-            estimate=le,
-            disturbance=ld,
-            inputs=tuple(last.inputs.tolist()),
-            rounding=self.rounding,
-        )
 
     @cached_property
     def error_set(self) -> Ellipsoid:
@@ -311,7 +252,7 @@ class Certificate(ReadOnlyArrays):
 
     @property
     def document(self) -> dict[str, Any]:
-        """The content of the certificate's file: the format's name, the checksum and the fields, as JSON values."""
+        """The content of the certificate's file as JSON values."""
         return document_of("certificate", _FORMAT, _content_of(self))
 
     def __eq__(self, other: object) -> bool:
@@ -321,7 +262,6 @@ class Certificate(ReadOnlyArrays):
         return hash(self.checksum)
 
     def __repr__(self) -> str:
-        """Short, in place of all numbers: it is a part of the settings of others."""
         return f"<Certificate for the plant {self.fingerprint[:16]}, {self.contract or 'without a contract'}>"
 
     def __str__(self) -> str:
@@ -352,12 +292,10 @@ class Certificate(ReadOnlyArrays):
 
     @property
     def _rests_elsewhere(self) -> bool:
-        """Whether its sets are around another point than the plant's operating one."""
         return bool(self.resting_state.any() or self.resting_input.any())
 
     @property
     def _widths(self) -> np.ndarray:
-        """How far E(L) reaches in each state, shape (n,)."""
         return np.sqrt(np.diag(self.L))
 
     def _fallback_text(self) -> str:
@@ -371,12 +309,8 @@ class Certificate(ReadOnlyArrays):
         return f"u = u_c + K (x_hat - x_c), with x_c = ({x_c}) and u_c = ({u_c}) from the operating point"
 
     def without_polytope(self) -> Certificate:
-        """Returns the certificate of the ellipsoid alone.
-
-        Raises:
-            CertificateError: If it does not keep the ellipsoid.
-        """
-        of_polytopes = ("polytope_share_of_box", "share_of_last_input", "no_polytope", "reach")
+        """Returns the certificate of the ellipsoid alone; raises CertificateError if it does not keep the ellipsoid."""
+        of_polytopes = ("polytope_share_of_box", "no_polytope", "reach")
         kept = {name: value for name, value in self.provenance.items() if name not in of_polytopes}
         return replace(self, polytope=None, provenance=kept)
 
@@ -395,14 +329,14 @@ class Certificate(ReadOnlyArrays):
         Raises:
             CertificateError: If the document or file is missing, damaged or altered.
         """
-        if isinstance(given, cls):
+        if isinstance(given, Certificate):
             return given
-        is_document = isinstance(given, Mapping)
+        name = "document" if isinstance(given, Mapping) else given
         try:
-            if is_document:
-                content = content_of(json.dumps(given), "document", "certificate", _FORMAT)
-            else:
-                content = read_content(given, "certificate", _FORMAT)  # pyright: ignore[reportArgumentType]
+            text = json.dumps(given) if isinstance(given, Mapping) else read_text(given)
+            content = content_of(text, name, "certificate", _FORMAT)
+        except OSError as error:
+            raise CertificateError(f"cannot read certificate {name}: {error.strerror}") from error
         except (TypeError, ValueError, RecursionError) as error:
             raise CertificateError(str(error)) from error
         try:
@@ -410,7 +344,6 @@ class Certificate(ReadOnlyArrays):
         except CertificateError:
             raise
         except (KeyError, TypeError, ValueError) as error:
-            name = "the document" if is_document else given
             raise CertificateError(f"{name} is not a certificate: an entry is missing or of a wrong kind") from error
 
     @classmethod
@@ -424,10 +357,7 @@ class Certificate(ReadOnlyArrays):
 
 
 def _content_of(certificate: Certificate) -> dict[str, Any]:
-    """Returns what the file of a certificate says, as JSON values.
-
-    Under a contract the arrays of all ages stand in `ages`, and those of the largest age are repeated before.
-    """
+    """Returns the content of a file: `ages` has the arrays of all ages, of which the largest is repeated before."""
     c, ages = certificate, None
     if (updates := c.updates) is not None:
         sets = {
@@ -437,6 +367,8 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
         }
         by_age = {name: [_listed(getattr(proof, name)) for proof in c.proofs] for name in ("shares", "inputs")}
         ages = {"contract": asdict(updates.contract), "sets": sets, **by_age}
+    proof, names = c.proofs[-1], ("state", "estimate", "disturbance")
+    shares = dict.fromkeys(names) if proof.shares is None else dict(zip(names, proof.shares.tolist(), strict=True))
     optional = {} if c.polytope is None else {"polytope": polytope_content(c.polytope)}
     optional |= {} if c.between_samples is None else {"between_samples": c.between_samples}
     if c.resting_state.any() or c.resting_input.any():
@@ -446,7 +378,7 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
         "K": c.K.tolist(),
         "Sigma": c.Sigma.tolist(),
         "D": c.D.tolist(),
-        "multipliers": asdict(c.multipliers),
+        "multipliers": shares | {"error": proof.rate, "inputs": _listed(proof.inputs), "rounding": c.rounding},
         "ages": ages,
         "fingerprint": c.fingerprint,
         "provenance": c.provenance,
@@ -458,20 +390,15 @@ def _listed(array: np.ndarray | None) -> list[float] | None:
 
 
 def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
-    """Returns the fields of a certificate from the content of its file.
-
-    Raises:
-        KeyError, TypeError, ValueError: If an entry is missing, of a wrong kind, or contradicts another one.
-    """
+    """Raises KeyError, TypeError or ValueError if an entry is missing, of a wrong kind, or contradicts another one."""
     fields = {name: content[name] for name in ("L", "K", "D", "fingerprint", "provenance")}
-    Sigma, ages = content["Sigma"], content["ages"]
-    stated = Multipliers(**content["multipliers"])
-    fields["rounding"] = stated.rounding
+    Sigma, ages, stated = content["Sigma"], content["ages"], content["multipliers"]
+    fields["rounding"] = stated["rounding"]
     fields |= {name: content.get(name) for name in ("between_samples", "resting_state", "resting_input")}
     if content.get("polytope") is not None:
         fields["polytope"] = polytope_of(content["polytope"], fields["resting_state"])
-    shares = [stated.state, stated.estimate, stated.disturbance]
-    own = Sigma, stated.error, None if shares == [None] * 3 else shares, stated.inputs
+    shares = [stated[name] for name in ("state", "estimate", "disturbance")]
+    own = Sigma, stated["error"], None if shares == [None] * 3 else shares, stated["inputs"]
     rows: list[tuple[Any, Any, Any, Any]] = [own]
     if ages is not None:
         sets = ages["sets"]
@@ -486,11 +413,7 @@ def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _as_array(value: Any, shape: tuple[int | None, ...], name: str) -> np.ndarray:
-    """Returns numbers, finite or not, as a float64 array of a shape, in which None stands for any length.
-
-    Raises:
-        ValueError: If it has another shape or is no numbers; texts of digits and truth values are none.
-    """
+    """Returns numbers, finite or not, as a float64 array of a shape, in which None stands for any length."""
     array = as_setting(value)
     if array is None or array.ndim != len(shape):
         raise ValueError(f"{name} must be numbers of shape {shape}, got {shown(value)}")

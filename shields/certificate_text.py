@@ -40,11 +40,7 @@ class Reach:
 
 
 def reach_in(safe_set: Any, plant: LinearPlant) -> tuple[Reach, ...]:
-    """Returns what `shields.reach_of` does, of any set inside the safe box.
-
-    Raises:
-        ValueError: If a solver fails.
-    """
+    """Returns what `shields.reach_of` does, of any set inside the safe box; raises ValueError if a solver fails."""
 
     def percent(row: np.ndarray, end: float) -> float | None:
         if not np.isfinite(end):
@@ -58,17 +54,9 @@ def reach_in(safe_set: Any, plant: LinearPlant) -> tuple[Reach, ...]:
 
 
 def size_of(certificate: Certificate) -> str:
-    """Returns the volume of the set as shares of the safe box and of the largest ellipsoid in it.
-
-    Where the share of the box is not known, how far limited quantities get inside the set, as far as that was recorded.
-    """
+    """Returns the recorded shares of the safe box and of the largest ellipsoid in it, or else the recorded reach."""
     recorded = certificate.provenance
     polytope_share, reach = recorded.get("polytope_share_of_box"), recorded.get("reach")
-    past = _text(
-        recorded.get("share_of_last_input"),
-        " where past inputs are the operating one, while in the set the last input has {:.3g} % of its range",
-        100.0,
-    )
     of_box = "{:.4g} %" if polytope_share else "{:.4g} % of the safe box's volume"
     at_rest = "{:.4g} % of the volume of the safe box of the states, with no input under way"
     ellipsoid = (
@@ -78,7 +66,7 @@ def size_of(certificate: Certificate) -> str:
     )
     size = ", ".join(filter(None, ellipsoid))
     reached = ", ".join(each for each in reach if isinstance(each, str)) if isinstance(reach, list) else ""
-    kept = _text(polytope_share, "{:.3g} % of the safe box's volume" + past, 100.0) or (reached and f"up to {reached}")
+    kept = _text(polytope_share, "{:.3g} % of the safe box's volume", 100.0) or (reached and f"up to {reached}")
     if certificate.polytope is not None and size:
         size = f"the ellipsoid {size}"
     return "; ".join(filter(None, [kept, size]))
@@ -96,12 +84,7 @@ def labeled(label: str, text: str) -> str:
 
 
 def contract_text(contract: ChannelContract | None, input_delay: int = 0) -> str:
-    """Returns what the channel has to promise.
-
-    Args:
-        contract: Contract of the certificate.
-        input_delay: What a downlink takes of the contract's age [steps].
-    """
+    """Returns what the channel has to promise where a downlink takes `input_delay` steps of the contract's age."""
     if contract is None:
         return "none: any packets may be lost or late"
     step = contract.quantization_step
@@ -128,5 +111,5 @@ def missing_polytope_of(recorded: dict[str, Any]) -> str:
 
 
 def _text(value: Any, pattern: str, scale: float = 1.0) -> str:
-    """Returns a recorded number, scaled, in a pattern; an empty string for anything else: files hold what they like."""
+    """Returns a recorded number, scaled, in a pattern; an empty string for anything else that a file holds."""
     return pattern.format(scale * value) if isinstance(value, float) else ""

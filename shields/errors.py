@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 
 class CertificateError(ValueError):
     """A certificate is damaged, belongs to another plant, or does not verify."""
@@ -20,42 +18,23 @@ class GuaranteeLostWarning(UserWarning):
     """The state of a shielded loop is not proved safe; said once per episode and reason."""
 
 
-class SynthesisInterrupted(KeyboardInterrupt):
-    """The synthesis was interrupted; the message says what it had reached.
-
-    Attributes:
-        certificate: `Certificate` of the largest set so far, which verifies exactly; None if there is none yet.
-    """
-
-    def __init__(self, message: str, certificate: Any = None) -> None:
-        super().__init__(message)
-        self.certificate = certificate
-
-
 class Infeasible(ValueError):
     """No certificate was found.
 
     Attributes:
-        binding: Name of the condition that cannot be met: "E1" (there is no error bound), "S" (the safe box is
-            unbounded), "U" (the input limits), "I" (invariance), "P" (a gain bears all, but its polytope was not
-            found), "R" (it has too many rows), or "T" (`time_limit` was over before anything was found); where a
-            candidate failed in exact verification only, the condition it failed. For method "paper": "C2", "C1", "C5"
-            (the input limit), or "grid" if OP is feasible but not at a point of the search grid.
+        binding: Name of the condition that cannot be met: "E1" (there is no error bound), "S" (the safe box), "U" (the
+            input limits), "I" (invariance), "P" (a gain bears all, but its polytope was not found), "R" (it has too
+            many rows), or "T" (`time_limit` was over before anything was found); where a candidate failed in exact
+            verification only, the condition it failed. "OP" for the published method.
         shortfall: By how much the condition fails: for "E1" the excess of the spectral radius over 1; for "I" and "U"
-            the fraction, in (0, 1], by which the radii of disturbance and estimation error must shrink; for "S" the
-            number of unbounded directions; for "C2" 1 - lambda_min(L)/alpha; where only exact verification failed, the
-            violation of that condition.
-        details: Further figures by name. Method "certified": `share_of_radii`, the fraction of the given radii that a
-            gain was found to bear; `max_age`, the age of samples for which there is a certificate.
-            Method "paper": `ratio`, the largest lambda_min(L)/alpha with its `kappa` and `rho`, and `largest_scale`,
-            the largest factor on gamma, Q and P0 for which OP is feasible.
+            the fraction, in (0, 1], by which the radii of disturbance and estimation error must shrink; where only
+            exact verification failed, the violation of that condition.
     """
 
-    def __init__(self, message: str, binding: str, shortfall: float, details: dict[str, float] | None = None) -> None:
+    def __init__(self, message: str, binding: str, shortfall: float) -> None:
         super().__init__(message)
         self.binding = binding
         self.shortfall = shortfall
-        self.details = details or {}
 
     def __reduce__(self):
-        return type(self), (self.args[0], self.binding, self.shortfall, self.details)
+        return type(self), (self.args[0], self.binding, self.shortfall)

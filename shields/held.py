@@ -30,8 +30,7 @@ _UNMOVED = 1e-3
 class SetPoints(ReadOnlyArrays):
     """Between which set points of an output no calm step is overridden.
 
-    A step is calm if the estimate is the set point itself. What is left at a set point is the room for the fluctuations
-    of the loop around it.
+    A step is calm if the estimate is the set point itself.
 
     Attributes:
         age: Age of the newest sample that error sets were taken for [steps].
@@ -91,11 +90,7 @@ def setpoint_range(certificate: Certificate, plant: LinearPlant, output: Any, ag
 
 
 def reach_of(certificate: Certificate, plant: LinearPlant) -> tuple[Reach, ...]:
-    """Returns how far each quantity that the safe box limits gets inside the safe set, by its support along the row.
-
-    Args:
-        certificate: Verified exactly here.
-        plant: The plant it was made for.
+    """Returns how far each quantity that the safe box limits gets inside the safe set of a certificate.
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -108,13 +103,7 @@ def reach_of(certificate: Certificate, plant: LinearPlant) -> tuple[Reach, ...]:
 def held_text(certificate: Certificate, plant: LinearPlant, input_delay: int = 0) -> str:
     """Returns `reach_of`, and the set points of the outputs that measure one state, in words.
 
-    Args:
-        certificate: Verified exactly here.
-        plant: The plant it was made for.
-        input_delay: What a downlink takes of the contract's age [steps]: no sample is fresher.
-
-    Raises:
-        CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
+    A downlink takes `input_delay` steps of the contract's age: no sample is fresher.
     """
     reach = ", ".join(map(str, reach_of(certificate, plant)))
     measured = [int(row.argmax()) for row in plant.H != 0.0 if row.sum() == 1]
@@ -126,7 +115,6 @@ def held_text(certificate: Certificate, plant: LinearPlant, input_delay: int = 0
 
 
 def _range_text(certificate: Certificate, plant: LinearPlant, state: int, input_delay: int) -> str:
-    """Returns between which set points of a state no calm step is overridden, with new and with old samples."""
     oldest, texts, unit = len(certificate.proofs) - 1, [], plant.state_units[state]
     for age in dict.fromkeys([min(input_delay, oldest), oldest]):
         points = setpoint_range(certificate, plant, state, age)
@@ -136,11 +124,6 @@ def _range_text(certificate: Certificate, plant: LinearPlant, state: int, input_
 
 
 def _row_of(output: Any, plant: LinearPlant) -> np.ndarray:
-    """Returns the row of an output, shape (n,).
-
-    Raises:
-        ValueError: If there is no such output.
-    """
     if isinstance(output, str):
         if output not in plant.state_names:
             raise ValueError(f"output must be one of the states {list(plant.state_names)}, got {shown(output)}")

@@ -8,7 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from ncs_gym.reading import json_values, read_text
+from ncs_gym.reading import json_values
 from shields.atomic_write import write_atomically
 
 
@@ -23,43 +23,22 @@ def with_literal_numbers(text: str) -> Any:
 
 
 def document_of(kind: str, format_name: str, content: Any) -> dict[str, Any]:
-    """Returns the document of some content, whose checksum counts every digit.
-
-    Args:
-        kind: What the content is, the key of the document that holds it.
-        format_name: Name of the format, with its version.
-        content: JSON values.
-    """
+    """Returns the document that holds JSON values under the key `kind`; its checksum counts every digit."""
     literal = with_literal_numbers(json.dumps(content))
     return {"format": format_name, "sha256": digest(literal), kind: content}
 
 
 def write_document(path: str | os.PathLike[str], document: dict[str, Any]) -> None:
-    """Writes a document; a reader never sees a part of it.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Writes a document; a reader never sees a part of it. Raises OSError if the file cannot be written."""
     write_atomically(Path(path), json.dumps(document, indent=1) + "\n")
 
 
-def read_content(path: str | os.PathLike[str], kind: str, format_name: str) -> Any:
-    """Returns the content of the document in a file, after comparing its checksum; for arguments see `document_of`.
+def content_of(text: str, path: Any, kind: str, format_name: str) -> Any:
+    """Returns the content of a document, which messages call `path`, after comparing its checksum.
 
     Raises:
-        ValueError: If the file is missing, no JSON or larger than documents may be (`ncs_gym.reading`), of another kind
-            or format, or altered; the message says which.
+        ValueError: If it is no JSON, of another kind or format, or altered.
     """
-    try:
-        text = read_text(path)
-    except (OSError, TypeError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it is not valid JSON"
-        raise ValueError(f"cannot read {kind} {path}: {reason}") from error
-    return content_of(text, path, kind, format_name)
-
-
-def content_of(text: str, path: Any, kind: str, format_name: str) -> Any:
-    """Returns what `read_content` does, of the text of a document, which messages call `path`."""
     try:
         document, literal = json_values(text), with_literal_numbers(text)
     except (TypeError, ValueError, RecursionError) as error:

@@ -30,9 +30,8 @@ MOST_MULTIPLIERS = (MOST_POINTS + 2) * MOST_ROWS
 class Polytope(ReadOnlyArrays):
     """The polytope P = {x : low <= G x <= high} around a point c (docs/shield_proof.md, "Polytopes").
 
-    For every row g, and for every row of the gain K, there are numbers lambda_i that write what the closed loop makes
-    of it as a sum of rows, g (A+BK) = sum_i lambda_i g_i + r; what is left, r, is mere rounding. They bound g (A+BK) x
-    on P from above, others from below. Where P is symmetric these are the same, and one row stands for two faces.
+    For every row g, and every row of the gain, multipliers lambda_i bound g (A+BK) x on P from above: g (A+BK) is
+    sum_i lambda_i g_i but for rounding. Others bound it from below; where P is symmetric these are the same.
 
     Attributes:
         rows: G, shape (r, n) [1 per unit of the state]; the first are the rows of the safe box.
@@ -50,11 +49,10 @@ class Polytope(ReadOnlyArrays):
     lower_multipliers: np.ndarray = FILLED_IN_LATER
 
     def __post_init__(self) -> None:
-        """Raises CertificateError if shapes do not fit, numbers are not finite, or the center is not inside."""
         try:
             rows = as_matrix(self.rows, (None, None), "the rows of the polytope")
             multipliers = as_matrix(self.multipliers, (None, len(rows)), "the multipliers of the polytope")
-            require_size(len(rows), len(multipliers))
+            _require_size(len(rows), len(multipliers))
             ends = _ends_of(self.low, self.high, len(rows))
             n = rows.shape[1]
             center = np.zeros(n) if self.center is None else as_vector(self.center, n, "the center of the polytope")
@@ -73,7 +71,7 @@ class Polytope(ReadOnlyArrays):
 
     @cached_property
     def is_symmetric(self) -> bool:
-        """Whether |g x| <= 1 for all rows is what it says, proved by the same multipliers from above and below."""
+        """Whether it says |g x| <= 1 for all rows, with the same multipliers from above and below."""
         same = np.array_equal(self.multipliers, self.lower_multipliers)
         return bool((self.low == -1.0).all() and (self.high == 1.0).all() and not self.center.any() and same)
 
@@ -117,9 +115,7 @@ class Polytope(ReadOnlyArrays):
         return float(gauges) if gauges.ndim == 0 else gauges
 
     def support(self, directions: Any) -> Any:
-        """Returns max of a'x over the polytope for a direction a (n,), or for each of shape (count, n), by a solver.
-
-        For pictures and tests: no proof takes it.
+        """Returns max a'x for a direction a, (n,), or each of (count, n), by a solver: no proof takes it.
 
         Raises:
             ValueError: If the polytope is unbounded in a direction.
@@ -149,8 +145,7 @@ class Polytope(ReadOnlyArrays):
         return self.center + directions / self.gauge(self.center + directions)[:, None]
 
 
-def require_size(rows: int, multipliers: int) -> None:
-    """Raises ValueError if a polytope would have more rows, or rows of multipliers, than any may have."""
+def _require_size(rows: int, multipliers: int) -> None:
     if rows > MOST_ROWS or multipliers > MOST_MULTIPLIERS:
         raise ValueError(
             f"a polytope has at most {MOST_ROWS} rows and {MOST_MULTIPLIERS} rows of multipliers, got {rows} and "
@@ -159,11 +154,7 @@ def require_size(rows: int, multipliers: int) -> None:
 
 
 def _ends_of(low: Any, high: Any, rows: int) -> np.ndarray:
-    """Returns the ends of rows, shape (2, rows): -1 and 1 for None; in a file's list None stands for an infinite one.
-
-    Raises:
-        ValueError: If they are no such ends, or a row has none.
-    """
+    """Returns the ends of rows, shape (2, rows): -1 and 1 for None; None in a list stands for an infinite one."""
     if low is None and high is None:
         return np.array([[-1.0], [1.0]]) * np.ones(rows)
     given = tuple(
@@ -177,15 +168,11 @@ def _ends_of(low: Any, high: Any, rows: int) -> np.ndarray:
 
 
 def _listed(ends: np.ndarray) -> list[float | None]:
-    """Returns ends, shape (r,), for a file, in which None stands for an infinite one."""
     return [each if np.isfinite(each) else None for each in ends.tolist()]
 
 
 def polytope_content(polytope: Polytope) -> dict[str, Any]:
-    """Returns the JSON values of a polytope; of the multipliers the pairs [number of the row, value] that count.
-
-    The center is the certificate's resting state. What is as by default is left out; an end that is open is null.
-    """
+    """Returns JSON values without defaults and the center; multipliers are pairs [number of the row, value]."""
     content = {"rows": polytope.rows.tolist(), "multipliers": _pairs_of(polytope.multipliers)}
     if polytope.is_symmetric:
         return content
@@ -212,7 +199,7 @@ def polytope_of(content: Any, center: Any) -> Polytope:
 
 
 def _multipliers_of(pairs: Any, rows: int) -> np.ndarray:
-    require_size(rows, len(pairs))
+    _require_size(rows, len(pairs))
     multipliers = np.zeros((len(pairs), rows))
     for row, entries in zip(multipliers, pairs, strict=True):
         if len({index for index, _ in entries}) < len(entries):

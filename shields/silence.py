@@ -18,8 +18,9 @@ from ncs_gym.validation import as_count, counted
 from shields.certificate import Certificate
 from shields.certificate_text import labeled
 from shields.polytope import Polytope
-from shields.runtime.rows_within_step import rows_within_step
+from shields.synthesis.design_problem import Rest
 from shields.synthesis.faces import Extremes, Faces
+from shields.synthesis.resting_point import around, limit_rows
 from shields.verification import ACTION_ROUNDING, require_valid
 from shields.verification.polytope_conditions import faces_of
 
@@ -48,19 +49,18 @@ class WayBack(NamedTuple):
 
 @dataclass(frozen=True)
 class Silence:
-    """What is known in advance of silences that exceed the contract of a certificate.
+    """What is known in advance of silences that exceed the contract of a certificate; printed, it says so in words.
 
-    `print(silence)` says it in words. Behind a downlink commands must keep arriving as its contract says.
+    Behind a downlink commands must keep arriving as its contract says.
 
     Attributes:
         max_age: Steps that the newest sample may be old under the contract, with what a downlink takes of them.
         dt: Duration of a step [s]; None for a plant that has none.
-        anywhere: For how many steps more the box is kept from any belief that the contract allows, whatever the agent
-            and the disturbance do (every mode of a shield but "monitor").
-        at_half: For how many steps more it is kept with the fallback input, from an estimate in half of the safe set,
-            which is made smaller around its resting point. The state itself may be outside the set then, so that with
-            large errors this may be less than `anywhere`.
-        at_rest: The same from an estimate at the resting point. All three are at most `MOST_STEPS`.
+        anywhere: For how many steps more, at most `MOST_STEPS`, the box is kept from any belief that the contract
+            allows, whatever the agent and the disturbance do (every mode of a shield but "monitor").
+        at_half: The same with the fallback input, from an estimate in half of the safe set around its resting point;
+            the state itself may be outside then.
+        at_rest: The same from an estimate at the resting point.
         ways_back: How the guarantee returns after outages.
     """
 
@@ -98,7 +98,7 @@ def silence_of(certificate: Certificate, plant: LinearPlant, input_delay: int = 
 
     Args:
         certificate: Verified exactly here.
-        plant: The plant it was made for.
+        plant: Its plant.
         input_delay: What a downlink takes of the contract's age [steps], as `NCSEnv.downlink_protocol` says.
 
     Raises:
@@ -115,7 +115,7 @@ def silence_of(certificate: Certificate, plant: LinearPlant, input_delay: int = 
     rarest = contract.max_age - input_delay + 1  # steps from one sample to the next, if they arrive at once
     outages = [many * max(contract.max_age, 1) for many in OUTAGES]
     ways = [WayBack(steps, *(way_back(recursion, steps, gap) for gap in (1, rarest))) for steps in outages]
-    at_half, at_rest = fallbacks.kept_from(0.5), fallbacks.kept_from(0.0)
+    at_half, at_rest = (fallbacks.kept(0, MOST_STEPS, share) for share in (0.5, 0.0))
     return Silence(contract.max_age, plant.dt, fallbacks.kept_anywhere(), at_half, at_rest, tuple(ways))
 
 
@@ -128,27 +128,16 @@ class _Fallbacks:
 
     so that a limit r y_j + s u_j with u_j = K y_hat_j is a sum of supports: of S for y_0, and of E(Sigma) and E(D). If
     the resting point is no equilibrium, sum_{i<j} (A + B K)^i (A x_c + B u_c - x_c) is added to y_hat_j.
-
-    Args:
-        certificate: Gives S, K and the error set of the oldest sample.
-        plant: Gives A, B, D and the limits.
     """
 
     def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
-        within, rest = rows_within_step(plant), certificate.fallback
-        (k, n), m = within.at_samples.shape, plant.m
-        at_samples = np.hstack([within.at_samples, np.zeros((k, m))])
-        inputs = np.hstack([np.zeros((m, n)), np.eye(m)])
-        rows = np.concatenate([at_samples, np.hstack([within.state, within.input]), inputs])
-        low = np.concatenate([within.low_at_samples, within.low, plant.input_ends[0]])
-        high = np.concatenate([within.high_at_samples, within.high, plant.input_ends[1]])
-        resting = rows @ np.concatenate([rest.resting_state, rest.resting_input])
-        disturbed = np.concatenate([np.zeros(k), within.disturbed, np.zeros(m)])
+        rest, n, k = certificate.fallback, plant.n, len(plant.box)
+        limits = around(limit_rows(plant, plant.disturbance.shape_matrix), Rest(rest.resting_state, rest.resting_input))
         # Where the box counts at samples alone, it is known to hold S.
         self._rows_on_states, self._first = k, 0 if plant.grid_rows is not None else k
-        self._low, self._high = low - resting, high - resting
-        self._own = disturbed + MARGIN * np.minimum(np.abs(self._low), np.abs(self._high))
-        self._on_state, self._on_input = rows[:, :n], rows[:, n:]
+        self._low, self._high = limits.low, limits.high
+        self._own = limits.disturbed + MARGIN * np.minimum(np.abs(self._low), np.abs(self._high))
+        self._on_state, self._on_input = limits.rows[:, :n], limits.rows[:, n:]
         self._on_estimate = self._on_state + self._on_input @ rest.gain
         self._powers, self._loops = _powers(plant.A), _powers(plant.A + plant.B @ rest.gain)
         self._moved = plant.A @ rest.resting_state + plant.B @ rest.resting_input - rest.resting_state
@@ -161,18 +150,14 @@ class _Fallbacks:
         """Returns after how many steps without a sample, from the oldest age that is allowed, the box may be left."""
         last, age = MOST_STEPS, 1  # the step from the oldest age itself is certified
         while age < last:
-            last = min(last, age + self._kept(age, last - age))
+            last = min(last, age + self.kept(age, last - age))
             age += 1
         return last
 
-    def kept_from(self, share: float) -> int:
-        """Returns the same from an estimate in a share of S, with the fallback input at every step."""
-        return self._kept(0, MOST_STEPS, share)
-
-    def _kept(self, age: int, most: int, share: float | None = None) -> int:
+    def kept(self, age: int, most: int, share: float | None = None) -> int:
         """Returns for how many steps the limits are kept, `age` steps after the oldest.
 
-        The state is in S then or, if a share is given, its estimate in that share of S.
+        The state is in S or, if a share is given, its estimate in that share of S.
         """
         if not self._keeps(age, 0, share)[self._first :].all():
             return 0
@@ -210,7 +195,7 @@ class _Fallbacks:
 
 
 def _powers(matrix: np.ndarray) -> np.ndarray:
-    """Returns the powers of a matrix up to `MOST_STEPS`, shape (MOST_STEPS + 1, n, n)."""
+    """Returns shape (MOST_STEPS + 1, n, n)."""
     powers = [np.eye(len(matrix))]
     for _ in range(MOST_STEPS):
         powers.append(matrix @ powers[-1])

@@ -5,13 +5,11 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 from numpy._core._multiarray_umath import __cpu_features__
 
@@ -64,14 +62,6 @@ def with_proof(certificate: Certificate, age: int = -1, **changes: Any) -> Certi
     proofs = list(certificate.proofs)
     proofs[age] = replace(proofs[age], **changes)
     return replace(certificate, proofs=tuple(proofs))
-
-
-@contextmanager
-def feasible_age_not_sought() -> Iterator[None]:
-    """Where nothing is asked of the message of `Infeasible`: that search takes longer than the synthesis."""
-    unchanged = mock.Mock(side_effect=lambda infeasible, *others, **more: infeasible)
-    with mock.patch("shields.synthesis.certification.with_age_that_helps", unchanged):
-        yield
 
 
 def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None, safe_set: str) -> Certificate:

@@ -256,10 +256,8 @@ def _parts(name: str, value: Any) -> list[np.ndarray]:
     return [np.atleast_1d(each) for each in (value if name.endswith("limits") else [value])]
 
 
-def family_of(members: Any, ranges: Any = None, *, all_points: bool = False, **settings: Any) -> LinearPlant:
+def family_of(members: Any, ranges: Any = None, **settings: Any) -> LinearPlant:
     """A plant of which several members, or ranges of parameters, are possible; a function is called in few points."""
-    if all_points:
-        return ncs_gym.family(members, ranges, **settings)
     with mock.patch("ncs_gym.plants.family.grid_size", return_value=6):
         return ncs_gym.family(members, ranges, **settings)
 

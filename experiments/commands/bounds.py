@@ -12,8 +12,8 @@ import tyro
 from experiments.runs.output_folder import require_place
 from ncs_gym import LinearPlant, Sum, Through, bounds_from_recording
 from ncs_gym.network.log_files import table_rows
+from ncs_gym.plants.description import of_outputs
 from ncs_gym.reading import LARGEST_LOG, read_file, require_packets
-from ncs_gym.recording import output_names
 from ncs_gym.validation import counted, shown
 
 
@@ -51,7 +51,7 @@ def bounds(settings: BoundsSettings) -> None:
     require_place(settings.out)
     plant = LinearPlant.load(settings.plant)
     n = len(plant.model.A)
-    outputs = output_names(plant.model.H, plant.state_names[:n])
+    outputs = of_outputs(plant.model.H, plant.state_names[:n])
     inputs, measured = _read(settings.file, [*plant.input_names], outputs)
     parts = plant.bounds.disturbance.parts
     E = np.hstack([each.E for each in parts]) if all(isinstance(each, Through) for each in parts) else None

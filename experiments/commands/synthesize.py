@@ -11,8 +11,6 @@ from experiments.runs.loops import plant_in_use
 from experiments.runs.output_folder import require_place
 from experiments.settings import PlantSettings
 from ncs_gym import ChannelContract
-from shields.certificate_text import size_of
-from shields.errors import SynthesisInterrupted
 from shields.packaged_certificates import synthesis_status
 
 
@@ -58,23 +56,14 @@ def synthesize(settings: SynthesizeSettings) -> None:
     if max_age is None and step is not None:
         raise ValueError("--quantization-step belongs to a contract of the channel: give --max-age, too")
     contract = None if max_age is None else ChannelContract(max_age, step or 0.0)
-    try:
-        with synthesis_status() as show:
-            certificate = shields.synthesize(
-                plant,
-                contract=contract,
-                safe_set=settings.safe_set,
-                time_limit=settings.time_limit,
-                progress=show,
-            )
-    except SynthesisInterrupted as interrupt:
-        if interrupt.certificate is None:
-            raise
-        interrupt.certificate.save(settings.out)
-        size = size_of(interrupt.certificate)
-        raise SynthesisInterrupted(
-            f"interrupted: the best certificate so far, which verifies ({size}), was saved to {settings.out}"
-        ) from interrupt
+    with synthesis_status() as show:
+        certificate = shields.synthesize(
+            plant,
+            contract=contract,
+            safe_set=settings.safe_set,
+            time_limit=settings.time_limit,
+            progress=show,
+        )
     certificate.save(settings.out)
     print(certificate, shields.verify(certificate, plant), sep="\n")
     # Under another contract than the environment's no downlink is known.

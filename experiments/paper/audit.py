@@ -43,21 +43,18 @@ _NOISE_VARIANCES = (1e-5, 1e-4, 1e-3)
 
 
 class Verdict(StrEnum):
-    """What became of a claim."""
+    """What became of a claim: undecided depends on a choice left open, vacuous holds without what it should show."""
 
     HOLDS = "holds"
-    # It holds but for the rounding of the printed numbers.
     ROUNDED = "holds, rounded"
     FAILS = "does not hold"
-    # It depends on a choice that the paper leaves open.
     UNDECIDED = "undecided"
     NOT_PRINTED = "not printed"
-    # It holds without what it is meant to demonstrate.
     VACUOUS = "vacuous"
 
     @classmethod
     def of(cls, holds: bool) -> Verdict:
-        """Returns the verdict on a claim that can only hold or not."""
+        """Returns HOLDS or FAILS."""
         return cls.HOLDS if holds else cls.FAILS
 
 
@@ -82,7 +79,7 @@ class Claim:
         computed: What follows from the paper's own numbers.
         verdict: A `Verdict`.
         charitable: Under which other reading it would hold, or how near it comes; empty if there is none.
-        defect: The `Defect` that the row shows; empty, whatever is given, unless the claim does not hold.
+        defect: The `Defect` that the row shows where the claim does not hold.
     """
 
     claim: str
@@ -154,7 +151,6 @@ def _margin(example: PaperExample) -> Claim:
 
 
 def _misread_alpha(example: PaperExample) -> float:
-    """Returns the alpha of Definition 4 with gamma in place of its square root, at the printed epsilon and kappa."""
     return ((example.plant.gamma + example.epsilon**0.5) / (1.0 - example.kappa**0.5)) ** 2
 
 
@@ -225,7 +221,6 @@ def _reachable_invariance(example: PaperExample) -> Claim:
 
 
 def _text_of(step: OneStep) -> str:
-    """Returns the step in words; an error of zero is left out. All but the end is shown as it was confirmed."""
     x, d, e, end = (v.tolist() for v in (step.state, step.disturbance, step.error, np.round(step.following, 4)))
     start = f"x = {x}, d = {d}" + (f", e = {e}" if np.any(step.error) else "")
     confirmed = "confirmed in exact arithmetic" if step.confirmed else "not confirmed exactly"
@@ -309,13 +304,10 @@ def design(example: PaperExample) -> Claim:
 
 
 def optimum(example: PaperExample, u_max: float, *, with_misread_margin: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Returns L, shape (2, 2), and K, shape (1, 2), of the largest set that OP finds at the printed kappa.
+    """Returns L, shape (2, 2), and K, (1, 2), of the largest set that OP finds at the printed kappa and another u_max.
 
-    Args:
-        example: The printed numbers.
-        u_max: Input limit in place of the printed one [m/s^2].
-        with_misread_margin: True keeps all of OP, with gamma in place of its square root in alpha. False drops (C2)
-            and (C4), the constraints that alpha enters, and with (C4) the communication error in the input limit.
+    With the misread margin all of OP counts, with gamma in place of its square root in alpha; without it neither (C2)
+    nor (C4), which alpha enters, and so no communication error in the input limit.
 
     Raises:
         ArithmeticError: If the solver finds no optimum.
@@ -455,11 +447,7 @@ def demonstration(example: PaperExample) -> Claim:
 
 
 def farthest_without_input(example: PaperExample) -> np.ndarray:
-    """Returns the largest |x_i+| = |A_i x + d_i| over the safe box with u = 0, shape (2,).
-
-    It is sum_j |A_ij| w_j + sqrt(D_ii), with w_j the half-widths of the box and E(D) the bound of the disturbance and
-    the truncated process noise together.
-    """
+    """Returns the largest |A_i x + d_i| over the safe box, sum_j |A_ij| w_j + sqrt(D_ii), shape (2,)."""
     plant = example.plant
     return np.abs(example.A) @ _half_widths(example) + np.sqrt(np.diag(plant.disturbance.shape_matrix))
 

@@ -72,13 +72,10 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class OneStep:
-    """The worst step of the closed loop that was found; in few digits if it leaves the set with these, too.
+    """The worst step x, d, e to x+ = (A+BK) x + d + e that was found; in few digits if it leaves the set with these.
 
     Attributes:
-        state: x, shape (n,).
-        disturbance: d, shape (n,).
-        error: e, shape (n,).
-        following: x+ = (A+BK) x + d + e, shape (n,).
+        state, disturbance, error, following: x, d, e and x+, shape (n,).
         level: x+'M x+ in floating point.
         confirmed: Whether exact arithmetic confirms x in S, d and e in their sets, and x+ outside S.
     """
@@ -97,13 +94,7 @@ def worst_step(
     """Returns the step from {x'Mx <= 1} that ends at the largest x+'M x+.
 
     It is found by ascent from random slopes: for a fixed slope M x+ each of x, d, e is the extreme point of its set.
-
-    Args:
-        closed: State matrix of the closed loop, A + B K, shape (n, n).
-        M: Matrix of the safe set, shape (n, n).
-        disturbances: The set of d.
-        errors: The set of e.
-        starts: Number of random slopes.
+    `closed` is A + B K, shape (n, n).
     """
     inverse = np.linalg.inv(M)
     states = Ellipsoid(0.5 * (inverse + inverse.T))
@@ -174,7 +165,7 @@ class OnlyIfExample:
     """A set, a closed loop and bounds on which to try the "only if" of Theorem 5, in rational numbers.
 
     Attributes:
-        M: Matrix of the set {x : x'Mx <= 1}.
+        M: Matrix of the set {x : x'Mx <= 1}, diagonal.
         closed_loop: A + B K.
         radius: The square root of gamma, and of epsilon.
         state: A state x of the set, a row, whose image shows how large kappa must be for (Cond.A).
@@ -193,11 +184,7 @@ class OnlyIfExample:
 
     @property
     def is_invariant(self) -> bool:
-        """Whether the set is proved invariant: the sum of the image of the set and of d + e lies in it.
-
-        d + e fills the ball of twice the radius, and the sum lies in the ellipsoid of shape
-        image / weight + ball / (1 - weight), for each weight; M is diagonal, and so is inverted exactly.
-        """
+        """Whether image / weight + ball / (1 - weight) proves the set invariant, with d + e in the ball of 2 radius."""
         size = len(self.M)
         shape = [[1 / self.M[i][i] if i == j else Fraction(0) for j in range(size)] for i in range(size)]
         identity = [[Fraction(i == j) for j in range(size)] for i in range(size)]

@@ -26,16 +26,8 @@ STARTS, STEPS = 100, 200
 class Definition1Filter:
     """The Kalman filter of Definition 1 for N episodes at once: it predicts with G = A + BK and corrects with y_k.
 
-    It has no equation for late packets. The last axis of every array is the episode.
-
-    Args:
-        example: The printed numbers.
-        plant: The plant with the covariances of its noise.
-        mean: First estimates, shape (n, N).
-        takes_late: Whether a late sample is taken for y_k; otherwise it is discarded.
-
-    Attributes:
-        mean: x_hat, shape (n, N).
+    It has no equation for late packets: they are taken for y_k, or discarded. The last axis of every array is the
+    episode; `mean` is x_hat, shape (n, N).
     """
 
     def __init__(self, example: PaperExample, plant: LinearPlant, mean: np.ndarray, *, takes_late: bool) -> None:
@@ -47,12 +39,9 @@ class Definition1Filter:
         self._samples: list[np.ndarray | None] = []
 
     def advance(self, u: np.ndarray, samples: np.ndarray | None, arrivals: list[tuple[int, np.ndarray]]) -> None:
-        """Moves one step on.
+        """Moves one step on; Definition 1 predicts with G, so the inputs u are not used.
 
-        Args:
-            u: Applied inputs, shape (m, N); not used, because Definition 1 predicts with G.
-            samples: What was measured at this step, shape (p, N); None if nobody sends.
-            arrivals: Ages of samples that arrive now, each with the episodes, shape (N,).
+        Samples are those of this step, (p, N); arrivals are the ages that arrive now, each with the episodes, (N,).
         """
         self._samples.insert(0, samples)
         self.mean = self._G @ self.mean
@@ -88,13 +77,9 @@ def replayed(example: PaperExample, plant: LinearPlant, mean: np.ndarray) -> Vec
 def largest_error(
     example: PaperExample, make_filter: MakeFilter, *, noise_variance: float | None = None, seed: int = 0
 ) -> float:
-    """Returns the largest e'e, e = B K e_up, over all starts and steps.
+    """Returns the largest e'e, e = B K e_up, over all starts and steps, with R = noise_variance I if it is given.
 
-    Args:
-        example: The printed numbers.
-        make_filter: Returns the filter, given the first estimates, shape (2, N).
-        noise_variance: R = noise_variance I in place of the plant's own.
-        seed: Seed of starts, noise, disturbance and channel, which are the same for every filter.
+    The seed is that of starts, noise, disturbance and channel, which are the same for every filter.
     """
     plant, channel, rng = example.plant, CASE_STUDY_CHANNEL, np.random.default_rng(seed)
     if noise_variance is not None:

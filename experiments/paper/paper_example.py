@@ -36,7 +36,7 @@ class PaperExample:
 
     @property
     def plant(self) -> LinearPlant:
-        """The plant with the bounds printed beside it (defaults of `truck_trailer`)."""
+        """The plant with the bounds printed beside it."""
         return truck_trailer()
 
     @property

@@ -70,7 +70,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
     process. Truncation is that of the `TimeLimit` around, or that environment's own.
 
     ## Info (the same keys from reset and step, every array a fresh copy)
-    States and inputs are deviations from the plant's operating point, if it has one (`plant.from_deviation`). Keys of
+    States and inputs are deviations from the plant's operating point (`plant.operating_state`). Keys of
     the second table are there where the environment has what stands with them.
 
     | key | shape or type | unit | meaning |

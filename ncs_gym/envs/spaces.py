@@ -104,7 +104,8 @@ def nearest_action(inputs: np.ndarray, plant: LinearPlant) -> np.ndarray:
         plant: Gives the limits: -1 stands for the low end of an input, 1 for the high one.
     """
     if inputs.ndim == 1:  # of one environment, in a fifth of the time
-        scaled = [(u - middle) / half for u, (middle, half) in zip(inputs.tolist(), plant.input_scales, strict=True)]
+        each = zip(inputs.tolist(), plant.input_middle.tolist(), plant.input_half.tolist(), strict=True)
+        scaled = [(u - middle) / half for u, middle, half in each]
         return np.array([min(max(each, -1.0), 1.0) for each in scaled], np.float32)
     actions = (inputs - plant.input_middle) / plant.input_half
     return np.minimum(np.maximum(actions, -1.0), 1.0).astype(np.float32)

@@ -1,9 +1,8 @@
 """Arrival histories: everything of an estimator but its means, worked out once for whatever arrived when.
 
-Covariances, gains, error shapes and the choice between two replays depend only on when packets arrive, never on what
-they say. Histories form a graph: its nodes are what arrived when, as far as it still matters, its edges are steps in
-time and arrivals. The scalar estimator follows it one node at a time, the vectorized one for all environments at once.
-Error statistics are kept by number beside it (`error_table`).
+Covariances, gains, error shapes and the choice between two replays depend only on when packets arrive. Histories form a
+graph: its nodes are what arrived when, as far as it still matters, its edges are steps in time and arrivals. Error
+statistics are kept by number beside it (`error_table`).
 """
 
 from __future__ import annotations
@@ -45,16 +44,11 @@ class ArrivalHistories:
 
     A history is what an estimator remembers besides means, inputs and samples: the error statistics of its present
     estimate, those before the update at the step of each age, which of the samples of these steps it holds, and the age
-    of the oldest one that arrived at this step and is not used yet. Two histories that agree in all this have one
-    number. Arrays that estimators look up are UNKNOWN where nothing is worked out yet.
-
-    Args:
-        recursion: Moves the error statistics.
-        channel: Gives the length of the replay buffer.
+    of the oldest one that arrived at this step and is not used yet. Arrays are UNKNOWN where nothing is worked out yet.
 
     Attributes:
-        recursion: The same.
-        channel: The same.
+        recursion: Moves the error statistics.
+        channel: Gives the length of the replay buffer.
         buffer: Age of the oldest sample that is of use [steps].
         root: Number of the history at the start of an episode.
         table: The distinct error statistics met so far.
@@ -95,7 +89,7 @@ class ArrivalHistories:
         return self._count
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ArrivalHistories:
-        return self  # shared by all estimators; nothing in it belongs to one of them
+        return self  # shared by all estimators
 
     def __getstate__(self) -> dict[str, Any]:
         """Leaves out the lock, which cannot be pickled."""
@@ -118,7 +112,7 @@ class ArrivalHistories:
     def after_arrival(self, history: int, age: int) -> int:
         """Returns the number of the history with one more sample, of some age; the same where it is of no use.
 
-        Samples older than the buffer, from before the first step or received before are of no use. Nor is one since
+        Samples older than the buffer, from before the first step or received before are of no use, and those since
         whose step the error was not certified all the time, if it is now: a replay could take it out again.
         """
         if not 0 <= age <= self.buffer:
@@ -136,7 +130,7 @@ class ArrivalHistories:
         return after
 
     def after_replay(self, history: int) -> int:
-        """Returns the number of the history once the samples that arrived at this step are used, or are not."""
+        """Returns the number of the history after the samples that arrived at this step are used, or are not."""
         target = self.target.item(history)
         if target == UNKNOWN:
             with self._lock:
@@ -144,7 +138,7 @@ class ArrivalHistories:
         return target
 
     def predicted(self, statistics: int, steps: int) -> int:
-        """Returns the number of what some steps without a sample make of statistics, by their number."""
+        """Returns the number of what some steps without a sample make of statistics."""
         if steps:
             with self._lock:
                 for _ in range(steps):
@@ -152,7 +146,7 @@ class ArrivalHistories:
         return statistics
 
     def predicted_many(self, statistics: np.ndarray, steps: int) -> np.ndarray:
-        """Returns what `predicted` does for many statistics, given and returned by their numbers, shape (N,)."""
+        """Returns `predicted` for many statistics, shape (N,)."""
         if steps == 0:
             return statistics
         known = self._ahead.get(steps, np.full(0, UNKNOWN))
@@ -208,7 +202,7 @@ class ArrivalHistories:
         return np.array([numbers[each] for each in histories.tolist()], np.int64)
 
     def _history(self, number: int) -> tuple[int, tuple[int, ...], tuple[bool, ...], int]:
-        """Returns what a history is: present statistics, priors and samples held by age, and where a replay begins."""
+        """Returns present statistics, priors and samples held by age, and where a replay begins."""
         priors, held = self._priors[:, number].tolist(), self._held[:, number].tolist()
         return self.present.item(number), tuple(priors), tuple(held), self.replay_from.item(number)
 
@@ -234,7 +228,7 @@ class ArrivalHistories:
         return number
 
     def _replayed(self, history: int) -> int:
-        """Works out the history from its oldest new sample on, and whether it is kept; returns the number then."""
+        """Works out the history from its oldest new sample on, and whether it is kept; returns its number."""
         present, priors, held, oldest = self._history(history)
         table, replayed, used, number = self.table, list(priors), [NO_SAMPLE] * (oldest + 1), present
         for age in range(oldest, -1, -1):
@@ -260,12 +254,7 @@ _shared_lock = threading.Lock()
 
 
 def arrival_histories(plant: LinearPlant, channel: Channel, contract: ChannelContract | None) -> ArrivalHistories:
-    """Returns the graph that all estimators of a plant behind a channel share in this process.
-
-    Raises:
-        UnstablePlantError: If the plant is not Schur stable and there is no contract.
-        ErrorSetError: If no error set is found.
-    """
+    """Returns the graph that all estimators of a plant behind a channel share; raises as `certified_error_set`."""
     # Only delays and quantization matter to it, not how packets are lost or when they are sent.
     kept = Channel(quantization_step=channel.quantization_step, delay=channel.delay, jitter=channel.jitter)
     key = plant.fingerprint, kept, contract

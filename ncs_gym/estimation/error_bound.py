@@ -16,14 +16,13 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.shape_matrices import rounded_up
 
-# Growth c of the optimal set: gives (E1) slack that an exact check can see, and updates room (docs/shield_proof.md).
+# Growth c of the optimal set: slack in (E1), and room for updates (docs/shield_proof.md).
 GROWTH = 1.1
 # Digits of a set relative to its extents, and of 1 - rate: what differs between processors beyond them is cut off.
 DIGITS, RATE_DIGITS = 11, 4
 # Beyond this many roundings of the largest entry a checked inequality is taken to hold.
 ROUNDINGS = 100.0
-# Smaller singular values, and smaller distances from the unit circle, count as zero in the test of Popov, Belevitch and
-# Hautus.
+# Smaller singular values, and distances from the unit circle, count as zero in the test of detectability.
 UNDETECTABLE = 1e-8
 # Flat disturbances are thickened by this fraction of their mean extent, so that (E1) has slack in every direction.
 THICKENING = 1e-9
@@ -52,7 +51,6 @@ _known: dict[tuple[str, ChannelContract | None], ErrorSet] = {}
 
 
 def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
-    """Returns the error sets by age under a contract; see `error_sets_by_age`."""
     try:
         sets = error_sets_by_age(plant, contract)
     except ErrorSetError as error:
@@ -69,7 +67,7 @@ def _conditional_set(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
 
 
 def _round_if_it_holds(rounded: ErrorSet, other: ErrorSet, plant: LinearPlant) -> ErrorSet:
-    """Returns an error set in round numbers if its conditions hold like that, else the other one."""
+    """Returns an error set in round numbers if its conditions hold, else the other one."""
     try:
         require_error_set(rounded, plant)
     except ErrorSetError:
@@ -80,13 +78,8 @@ def _round_if_it_holds(rounded: ErrorSet, other: ErrorSet, plant: LinearPlant) -
 def unseen_state(A: np.ndarray, H: np.ndarray, widths: np.ndarray, names: Sequence[str]) -> str | None:
     """Returns the state with the largest part in a mode that neither decays nor shows in the outputs; None without one.
 
-    The test of Popov, Belevitch and Hautus for detectability; of the transposed model it is that for stabilizability.
-
-    Args:
-        A: Of x+ = A x, shape (n, n).
-        H: Of y = H x, shape (p, n).
-        widths: How large each state gets, shape (n,): their units.
-        names: Of the states, n of them.
+    The test of Popov, Belevitch and Hautus for detectability, states being in units of widths, (n,); of the transposed
+    model it is that for stabilizability.
     """
     A, H = A * widths / widths[:, None], H * widths
     H = H / np.maximum(np.abs(H).max(axis=1, keepdims=True), np.finfo(float).tiny)
@@ -99,13 +92,7 @@ def unseen_state(A: np.ndarray, H: np.ndarray, widths: np.ndarray, names: Sequen
 
 
 def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
-    """Raises unless an error set's conditions hold by more than the rounding of evaluating them.
-
-    Estimators rest on them; (C2) includes room for the rounding of an updated estimate (docs/shield_proof.md).
-
-    Raises:
-        ErrorSetError: Naming the condition.
-    """
+    """Raises ErrorSetError, naming the condition, unless all of a set hold by more than the rounding of this check."""
     for name, triples in error_set.needs(plant).items():
         if not all(_holds(*triple) for triple in triples):
             raise ErrorSetError(
@@ -117,12 +104,7 @@ def require_error_set(error_set: ErrorSet, plant: LinearPlant) -> None:
 def _holds(outer: np.ndarray, inner: np.ndarray, size: np.ndarray) -> bool:
     """Returns whether outer - inner is positive definite by more than rounding, each state in units of the outer set.
 
-    In those units a state that is known exactly, such as an input under way, counts as much as the others do.
-
-    Args:
-        outer: Shape of the set that must be larger, (n, n).
-        inner: Shape of the other one, (n, n).
-        size: Entry by entry, what the rounding of `inner` grows with, shape (n, n).
+    The rounding of the inner shape grows with `size`, entry by entry.
     """
     with np.errstate(all="ignore"):
         scale = 1.0 / np.sqrt(np.diag(outer))
@@ -136,13 +118,8 @@ def _holds(outer: np.ndarray, inner: np.ndarray, size: np.ndarray) -> bool:
 def _unconditional_set(plant: LinearPlant) -> ErrorSet:
     """Returns the error set of a stable plant in closed form (docs/shield_proof.md, (E0) and (E1)).
 
-    For a fixed rate the smallest solution of (E1) is a Lyapunov series; where it does not cover the first
-    estimate, the missing part is added as a source to the same series. The rate minimizes tr(W Sigma), W the
-    weight of the safe box. Multiplying by c = 1.1 keeps both conditions and gives them slack.
-
-    Proof of the bound: e_0 lies in E(r0^2 I). The error obeys e+ = A e - d, so with e in E(Sigma) its support
-    is at most that of A Sigma A'/rate + D/(1 - rate), which is inside E(Sigma) by (E1); by induction e_k lies
-    in E(Sigma) for all k with no packet at all.
+    For a fixed rate the smallest solution of (E1) is a Lyapunov series; where it does not cover the first estimate, the
+    missing part is added as a source to the same series. The rate minimizes tr(W Sigma), W the weight of the safe box.
     """
     from scipy.optimize import minimize_scalar  # takes long to import
 
@@ -175,10 +152,7 @@ def _unconditional_set(plant: LinearPlant) -> ErrorSet:
 
 
 def _smallest_solution(A: np.ndarray, D: np.ndarray, first: np.ndarray, rate: float) -> np.ndarray:
-    """Returns the Lyapunov solution of (E1) for one rate, enlarged until it covers `first`, shape (n, n).
-
-    What cannot be solved is infinite; what is solved badly, `require_error_set` sees.
-    """
+    """Returns the Lyapunov solution of (E1) for one rate, enlarged to cover `first`; infinite where there is none."""
     try:
         solution = _lyapunov(A / np.sqrt(rate), D / (1.0 - rate))
         values, vectors = np.linalg.eigh(first - solution)

@@ -13,8 +13,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum, rounded_up
 
-# Digits of sets, relative to their extents, of gains and of rates: what differs between processors beyond them is cut
-# off. It is less than the margin below.
+# Digits of sets, relative to their extents, of gains and of rates: what differs between processors is cut off.
 DIGITS = 10
 # The sets are made for noise this much larger than allowed, so that at run time good gains nearly always fit in.
 NOISE_MARGIN = 1.2
@@ -27,9 +26,7 @@ MULTIPLIERS = np.round(np.concatenate([np.linspace(0.01, 0.99, 99), 1.0 - np.log
 ITERATIONS = 1000
 # No set is thinner than this in any direction, in units of the weight: an input under way is known exactly.
 THINNEST = 1e-5
-# The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts. It
-# is as fast as these units make it: one that has to be fast by the step asks for inputs beyond all limits where steps
-# are short.
+# The regulator whose answer to an error counts, in units of the box and of the input limits, and how much it counts.
 EFFORT, ANSWER = 10.0, 10.0
 # Digits of that regulator.
 REGULATOR_DIGITS = 6
@@ -38,11 +35,7 @@ LARGEST = 1e6
 
 
 def error_sets_by_age(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
-    """Returns error sets by age, without a solver.
-
-    Raises:
-        ErrorSetError: If the iteration finds none, or none that float64 can hold; it says what was met.
-    """
+    """Returns error sets by age; raises ErrorSetError if the iteration finds none that float64 can hold."""
     with np.errstate(all="ignore"):
         try:
             return _iterated_sets(plant, contract)
@@ -67,13 +60,6 @@ def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
     gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until it holds what
     comes of it, which is (C0), (C1) and (C2). Shares minimize traces weighted with what errors cost.
-
-    Args:
-        plant: The plant with its bounds.
-        contract: The channel's promise.
-
-    Raises:
-        ErrorSetError: If the iteration finds none.
     """
     # Coordinates z = T^-1 x with W = (T T')^-1, so that units do not matter.
     inverse = np.linalg.cholesky(_cost(plant)).T
@@ -120,7 +106,7 @@ def _require_bounded(shape: np.ndarray, largest: float, plant: LinearPlant, T: n
 
 
 def _cost(plant: LinearPlant) -> np.ndarray:
-    """Returns W, shape (n, n): the size of an error in the box, and that of a regulator's answer to it."""
+    """Returns W: the size of an error in the box, and that of a regulator's answer to it."""
     inverse = np.linalg.cholesky(plant.weight).T
     T = np.linalg.inv(inverse)
     K = regulator_gain(inverse @ plant.A @ T, inverse @ plant.B * plant.input_half, EFFORT, decay=1.0)

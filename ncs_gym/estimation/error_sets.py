@@ -36,14 +36,13 @@ class ErrorSet(ReadOnlyArrays):
         (C1) Sigma_{j+1} >= A Sigma_j A'/lam_j + D/(1-lam_j)                             j = 0..h
         (C2) Sigma_0 >= (I-T_j H) Sigma_j (I-T_j H)'/mu_j + T_j N T_j'/(1-mu_j)          j = 1..h+1
 
-    (C2) holds with room for the rounding of an estimate that is updated (docs/shield_proof.md, "Rounding").
+    with room for the rounding of an estimate that is updated (docs/shield_proof.md, "Rounding").
 
     Attributes:
         shapes: Sigma_j, shape (h + 2, n, n), or (1, n, n) without a contract [squares of the units of the state].
         rates: lam_j in (0, 1), shape (h + 1,), or (1,): they carry the set of one age into that of the next.
         contract: The promise of the channel that they rest on; None for none.
-        gains: T_1 .. T_{h+1} under a contract, shape (h + 1, n, p). Without one, an update that would lead out of the
-            set is left out.
+        gains: T_1 .. T_{h+1} under a contract, shape (h + 1, n, p).
         multipliers: mu_1 .. mu_{h+1}, shape (h + 1,).
         noise: N of the contract's quantizer, shape (p, p).
     """
@@ -65,7 +64,7 @@ class ErrorSet(ReadOnlyArrays):
 
     @property
     def promised(self) -> np.ndarray:
-        """Those of promised ages, shape (k, n, n): whatever an input is decided from lies in one of them."""
+        """Those of promised ages, shape (k, n, n): the error at every decision lies in one of them."""
         return self.shapes[: len(self.rates)]
 
     @property
@@ -89,9 +88,7 @@ class ErrorSet(ReadOnlyArrays):
         return float(self.rates[0 if self.contract is None else age])
 
     def remains_certified(self, certified: bool, age: int, predicted: np.ndarray) -> bool:
-        """Returns whether an error is in the set of its age, and stays in those that follow, a step later.
-
-        Without a contract it stays where it is once inside, by (E1); (C1) leads on from the set of its age.
+        """Returns whether an error is certified a step later, by (E1) or (C1).
 
         Args:
             certified: Whether it was.
@@ -107,7 +104,7 @@ class ErrorSet(ReadOnlyArrays):
         return replace(self, shapes=factor * self.shapes)
 
     def needs(self, plant: LinearPlant) -> dict[str, list[Need]]:
-        """Returns what has to hold, by the name of the condition; (C2) with the rounding of the estimate."""
+        """Returns what has to hold, by the name of the condition."""
         D, identity = plant.disturbance.shape_matrix, np.eye(plant.n)
         first = congruence_sum((identity, plant.initial_error.shape_matrix, 1.0))
         grown = [
@@ -133,9 +130,8 @@ class ErrorSet(ReadOnlyArrays):
     def rounding_of_update(self, plant: LinearPlant, j: int) -> np.ndarray:
         """Returns F for an update with T_{j+1}, shape (n, n): at least the plant's `estimate_rounding`.
 
-        With x_hat up to SIMULATED_REACH half-widths out, and a residual that an error in E(Sigma_{j+1}) and noise in
-        E(N) leave, x_hat + T (y - H x_hat) is rounded by at most half of r (docs/shield_proof.md, "What the room
-        covers").
+        With x_hat up to SIMULATED_REACH half-widths out, and a residual of an error in E(Sigma_{j+1}) and noise in
+        E(N), x_hat + T (y - H x_hat) is rounded by at most half of r (docs/shield_proof.md, "What the room covers").
         """
         gain, H, reach = np.abs(self.gains[j]), np.abs(plant.H), SIMULATED_REACH * plant.half_widths
         residual = H @ np.sqrt(self.shapes[j + 1].diagonal()) + np.sqrt(self.noise.diagonal())
@@ -145,7 +141,7 @@ class ErrorSet(ReadOnlyArrays):
 
 
 def congruence_sum(*terms: tuple[np.ndarray, np.ndarray, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the sum of w F P F' over terms (F, P, w), and that of w |F| |P| |F|', with which its rounding grows."""
+    """Returns the sum of w F P F' over terms (F, P, w), and of w |F| |P| |F|', with which its rounding grows."""
     total = sum(weight * factor @ shape @ factor.T for factor, shape, weight in terms)
     size = sum(weight * np.abs(factor) @ np.abs(shape) @ np.abs(factor).T for factor, shape, weight in terms)
     return np.asarray(total), np.asarray(size)

@@ -1,7 +1,6 @@
 """The distinct error statistics that estimators meet, by number, and what predictions and updates make of each.
 
-Everything is kept by number in a few large arrays. A graph of many small objects would keep the garbage collector busy
-for tens of milliseconds at a time, and would take several times the memory.
+They are kept in a few large arrays: many small objects would keep the garbage collector busy.
 """
 
 from __future__ import annotations
@@ -15,14 +14,13 @@ from ncs_gym.estimation.innovation import common_axes, quick_test
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.validation import frozen
 
-# Number of what is not worked out yet, and of the statistics that stand for "no sample is used here": their gain is
-# zero.
+# Number of what is not worked out yet, and of "no sample is used here", whose gain is zero.
 UNKNOWN, NO_SAMPLE = -1, 0
-# Numbers that arrays have room for to begin with; the room doubles when it is used up.
+# Numbers that arrays have room for to begin with.
 FIRST_CAPACITY = 256
 # What a dictionary takes for a key of bytes and its number, without those bytes.
 BYTES_PER_KEY = 150
-# Bytes of the hash that statistics are found by: that two of them ever have the same one is out of the question.
+# Bytes of the hash that statistics are found by.
 _HASH_SIZE = 16
 # The arrays of a table, whose last or first axis is the number.
 _BY_NUMBER_LAST = "gains", "quick_tests"
@@ -35,15 +33,12 @@ _BY_NUMBER = (
 class ErrorTable:
     """The distinct error statistics met so far, and what a prediction and an update make of each, worked out once.
 
-    The recursion rounds statistics, so that they recur; equal ones have one number. Reading what is there needs no
-    lock; whoever adds to the table holds that of the graph it belongs to.
-
-    Args:
-        recursion: Moves the error statistics.
-        oldest: Ages above this make no difference.
+    The recursion rounds statistics, so that they recur; equal ones have one number. Who adds to the table holds the
+    lock of its graph.
 
     Attributes:
-        recursion, oldest: The same.
+        recursion: Moves the error statistics.
+        oldest: Ages above this make no difference.
         gains: Of an update, by number, shape (n, p, capacity); zero until it is worked out.
         quick_tests: W of the quick innovation test, by number, shape (p, p, capacity); zero until it is worked out.
     """
@@ -68,17 +63,17 @@ class ErrorTable:
         return self._count
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ErrorTable:
-        return self  # shared by all estimators, as the graph that it belongs to
+        return self  # shared by all estimators
 
     @property
     def bytes_each(self) -> int:
-        """What the statistics of one number take, about."""
+        """What the statistics of one number take, about [bytes]."""
         n, p = self.recursion.plant.n, self.recursion.plant.p
         return BYTES_PER_KEY + _HASH_SIZE + 8 * (2 * n**2 + 2 * n * p + 2 * p**2 + 3) + 2
 
     @property
     def shapes(self) -> np.ndarray:
-        """The error shapes Sigma_k by number, shape (count, n, n), read-only: many estimators share them."""
+        """The error shapes Sigma_k by number, shape (count, n, n), read-only."""
         return frozen(self._shapes[: self._count])
 
     @property
@@ -138,16 +133,13 @@ class ErrorTable:
         return after
 
     def update(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the gain of an update that is worked out, shape (n, p), and W of its quick test, (p, p).
-
-        The gain is zero where the sample must not be used.
-        """
+        """Returns the gain of an update that is worked out, (n, p), zero if the sample is not used, and W, (p, p)."""
         gain, (n, p, _) = self._gains[number], self.gains.shape
         gain = gain.reshape(p, n).T if self._by_columns[number] else gain.reshape(n, p)
         return gain, self._quick_tests[number]
 
     def innovation_axes(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the axes in which residuals before an update of some statistics are tested exactly."""
+        """Returns `common_axes` for residuals before an update of some statistics."""
         if number not in self._axes:
             self._axes[number] = common_axes(self._spread(self.shape(number)), self.recursion.sets.noise)
         return self._axes[number]

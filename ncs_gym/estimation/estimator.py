@@ -22,14 +22,9 @@ from ncs_gym.validation import CopiedWhole, frozen, setting
 class PastSteps(CopiedWhole):
     """What an estimator keeps of the last steps: of one loop, or of N along the last axis of every array.
 
-    Args:
-        plant: The plant, whose inputs are known exactly.
-        histories: The graph of arrival histories.
-        size: N; None for one loop without that axis.
-
     Attributes:
-        plant: The same.
-        histories: The graph in use; another one after histories were forgotten.
+        plant: The plant, whose inputs are known exactly.
+        histories: The graph of arrival histories in use; another one after histories were forgotten.
         mean: x_hat, shape (n,) or (n, N), read-only.
         age: Steps since the newest sample used was taken, an int or shape (N,).
     """
@@ -44,7 +39,7 @@ class PastSteps(CopiedWhole):
         self._remember((), (), ())
 
     def _remember(self, priors: Iterable, inputs: Iterable, samples: Iterable) -> None:
-        """Keeps means before updates, inputs that led there and samples (None where nobody sent), by age."""
+        """Keeps means before updates, inputs that led there and samples, by age."""
         length = self.histories.buffer + 1
         self._priors: deque[np.ndarray] = deque(priors, maxlen=length)
         self._inputs: deque[np.ndarray] = deque(inputs, maxlen=length)
@@ -52,11 +47,11 @@ class PastSteps(CopiedWhole):
 
     @property
     def table(self) -> ErrorTable:
-        """The error shapes by the numbers that `numbered` returns; another one after shapes were forgotten."""
+        """The error shapes by the numbers that `numbered` returns."""
         return self.histories.table
 
     def _predict(self, u: np.ndarray, samples: np.ndarray | None) -> None:
-        """Moves the mean one step on with an input, (m,) or (m, N), before it takes in what arrived."""
+        """Moves the mean one step on with an input, (m,) or (m, N)."""
         self.mean = frozen(self._predicted(self.mean, u))
         self._priors.appendleft(self.mean)
         self._inputs.appendleft(u)
@@ -64,7 +59,7 @@ class PastSteps(CopiedWhole):
         self.age += 1
 
     def _predicted(self, mean: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns A x_hat + B u; an unstable plant's within the limit of its states."""
+        """Returns A x_hat + B u, within the limit of an unstable plant's states."""
         mean = self.plant.A.dot(mean) + self.plant.B.dot(u)
         return mean if self._limit is None else np.minimum(np.maximum(mean, -self._limit), self._limit)
 
@@ -74,8 +69,8 @@ class Estimator(PastSteps):
 
     The packets of a step are applied at the steps their samples were taken at, and everything after is replayed. Next
     to mean and covariance runs a hard ellipsoid E(Sigma_k) that holds the error at every step and never leaves the
-    certified E(Sigma) (docs/shield_proof.md): predictions and updates are accepted only inside it. What depends only on
-    when packets arrive is looked up (`ArrivalHistories`).
+    certified E(Sigma) (docs/shield_proof.md). What depends only on when packets arrive is looked up
+    (`ArrivalHistories`).
 
     Args:
         plant: The plant, whose inputs the estimator knows exactly.
@@ -120,17 +115,13 @@ class Estimator(PastSteps):
         self._begin(np.zeros(plant.n))
 
     def reset(self, mean: np.ndarray) -> None:
-        """Starts an episode at step 0 with a first estimate, shape (n,), whose error lies in E(r0^2 I).
-
-        The first call on an estimator that has not moved begins episode 0, every other one the next episode.
-        """
+        """Starts the next episode, or episode 0 at first, with an estimate, shape (n,), whose error is in E(r0^2 I)."""
         self.episode += not self._is_new
         self._is_new = False
         self.histories = self._usual
         self._begin(mean)
 
     def _begin(self, mean: np.ndarray) -> None:
-        """Forgets everything but an estimate, shape (n,)."""
         self.step = self.age = 0
         self.alarm = self.damaged = False
         self.mean = frozen(np.array(mean, dtype=np.float64))
@@ -144,15 +135,11 @@ class Estimator(PastSteps):
 
     @property
     def covariance(self) -> np.ndarray:
-        """P, (n, n), of a Kalman filter that takes the same samples; picks gains and is never used for safety."""
+        """P, (n, n), of a Kalman filter that takes the same samples; it is never used for safety."""
         return self.table.statistics(self.histories.present.item(self.history)).covariance
 
     def as_filterpy(self) -> Any:
-        """Returns the present estimate as a `filterpy.kalman.KalmanFilter` with the model of this estimator, a copy.
-
-        The estimator itself looks covariances and gains up by when packets arrived, which an object that is moved step
-        by step cannot; between two arrivals the two do the same.
-        """
+        """Returns the estimate as a `filterpy.kalman.KalmanFilter`, which does the same between two arrivals."""
         from filterpy.kalman import KalmanFilter  # takes long to import; it has no types
 
         plant, recursion = self.plant, self.histories.recursion
@@ -168,8 +155,7 @@ class Estimator(PastSteps):
         Args:
             u: Applied input, shape (m,) [physical units].
             packets: In any order. Those of another episode are discarded, and stamps from the future, from before the
-                first step, older than the replay buffer or seen before; another value with a stamp that was seen before
-                raises the alarm.
+                first step, older than the buffer or seen before; another value with a stamp seen before is an alarm.
         """
         self._is_new = False
         self.step += 1
@@ -186,11 +172,7 @@ class Estimator(PastSteps):
                 self._usual = self.histories
 
     def numbered(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
-        """Returns estimate, (n,), and number of the error shape in `table` after the next steps, given inputs, (m,).
-
-        It is what `advance` makes of the present estimate with these inputs and without packets: the error then lies in
-        that ellipsoid, whatever packets arrive later.
-        """
+        """Returns estimate, (n,), and number of the error shape in `table` after steps with inputs, (m,), alone."""
         mean = self.mean
         for u in inputs:
             mean = frozen(self._predicted(mean, u))
@@ -240,10 +222,7 @@ class Estimator(PastSteps):
         return target
 
     def _test_exactly(self, residual: np.ndarray, statistics: int) -> None:
-        """Latches the alarm if a residual y - H x_hat lies outside E(H Sigma H') + E(N).
-
-        The ellipsoid of shape H Sigma H' + N, which the quick test is about, lies inside that sum.
-        """
+        """Latches the alarm if a residual y - H x_hat lies outside E(H Sigma H') + E(N)."""
         recursion, H = self.histories.recursion, self.plant.H
         spread = H @ self.histories.table.shape(statistics) @ H.T
         self.alarm |= bool(outside_sum(residual[None], spread, recursion.sets.noise, ALARM_TOLERANCE)[0])

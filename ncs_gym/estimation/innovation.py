@@ -18,14 +18,10 @@ HALVINGS = 60
 
 
 def quick_test(spread: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Returns the matrix W, shape (p, p), of the quick test: a residual with r'Wr <= 1 is possible.
+    """Returns W, shape (p, p), of the quick test, given H Sigma_k H' and N: a residual with r'Wr <= 1 is possible.
 
-    The ellipsoid of shape H Sigma_k H' + N lies inside the Minkowski sum. Where its inverse would be too inexact to
-    vouch for anything, W is infinite on the diagonal: no residual passes then.
-
-    Args:
-        spread: H Sigma_k H', shape (p, p).
-        noise: N, shape (p, p).
+    The ellipsoid of shape H Sigma_k H' + N lies inside the Minkowski sum. Where its inverse would be too inexact, W is
+    infinite on the diagonal: no residual passes then.
     """
     bound = spread + noise
     extent = np.sqrt(bound.diagonal())
@@ -40,14 +36,7 @@ def quick_test(spread: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 
 def outside_sum(points: np.ndarray, first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
-    """Returns which points lie outside E(P1) + E(P2) by more than a tolerance, bool of shape (k,); NaN lies outside.
-
-    Args:
-        points: r, shape (k, p).
-        first: P1, shape (p, p), positive semidefinite.
-        second: P2, shape (p, p), positive definite.
-        tolerance: Relative.
-    """
+    """Returns which points, (k, p), lie outside E(P1) + E(P2), P2 > 0, by more than a relative tolerance, (k,)."""
     axes, values = common_axes(first, second)
     return outside_sum_in_axes(np.square(axes @ points.T), values[:, None], tolerance)
 
@@ -56,8 +45,8 @@ def outside_sum_in_axes(squares: np.ndarray, values: np.ndarray, tolerance: floa
     """Returns which points lie outside E(P1) + E(P2), in axes in which both are diagonal, bool of shape (k,).
 
     Any multiplier nu splits r into P1 w / nu + P2 w / (1-nu) with w = (P1/nu + P2/(1-nu))^-1 r. If both parts lie in
-    their ellipsoids, r lies in the sum; if r'w > 1, it does not. r'w is concave in nu, and its slope
-    is the difference of the parts' squared gauges, so that halving finds a multiplier that decides.
+    their ellipsoids, r lies in the sum; if r'w > 1, it does not. r'w is concave in nu, and its slope is the difference
+    of the parts' squared gauges, so that halving finds a multiplier that decides.
 
     Args:
         squares: Squared coordinates of the points in the axes F of `common_axes`, shape (p, k); NaN lies outside.

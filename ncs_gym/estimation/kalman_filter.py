@@ -1,8 +1,4 @@
-"""The Kalman filter without its mean: covariance, gain and error ellipsoid, which do not depend on what is measured.
-
-The recursion of the covariance is two pure functions. filterpy's filter keeps a mean, which there is none of here, and
-changes in place, which what many estimators share must not; `Estimator.as_filterpy` makes one of an estimate.
-"""
+"""The Kalman filter without its mean: covariance, gain and error ellipsoid, which do not depend on what is measured."""
 
 from __future__ import annotations
 
@@ -46,13 +42,12 @@ class ErrorStatistics(NamedTuple):
     """Everything that is known of an estimation error; none of it depends on measurements or inputs.
 
     Attributes:
-        covariance: P, shape (n, n), of a Kalman filter that takes the same samples. It picks gains and is never used
-            for safety.
+        covariance: P, shape (n, n), of a Kalman filter that takes the same samples; it only picks gains.
         shape: Sigma_k, shape (n, n): the error x_hat - x lies in E(Sigma_k).
-        age: Steps since the newest sample used was taken; the first estimate counts as a sample at step 0.
-        certified: Whether E(Sigma_k) lies in the certified set of its age, and will for as long as the contract is
-            kept: an update, or the first estimate, brought it into that of age 0, and from there (C1) and (C2) lead on.
-            Without a contract, whether it lies in the one certified set, which nothing leaves.
+        age: Steps since the newest sample used was taken; the first estimate counts as one.
+        certified: Whether E(Sigma_k) lies in the certified set of its age, and will while the contract is kept: an
+            update, or the first estimate, brought it into that of age 0, and (C1) and (C2) lead on. Without a contract,
+            whether it lies in the one certified set, which nothing leaves.
     """
 
     covariance: np.ndarray
@@ -68,10 +63,9 @@ class ErrorRecursion:
         plant: The plant with its bounds.
         quantization_step: Step of the channel's quantizer, in the units of y.
         error_set: The certified sets, by age under a contract.
-        covariance_bits: Bits that are kept of the factors of covariances (a gain's optimality is of second order in
-            them).
+        covariance_bits: Bits that are kept of the factors of covariances.
         shape_step: What shapes are rounded up to, as a fraction of the certified set's square extent.
-        first: The statistics at the start; by default those of a first estimate, whose error lies in E(r0^2 I).
+        first: The statistics at the start; by default those of a first estimate.
 
     Attributes:
         plant, error_set, first: The same.
@@ -95,9 +89,8 @@ class ErrorRecursion:
             shape = plant.initial_error.shape_matrix
             first = ErrorStatistics(plant.kalman_covariances[2], shape, 0, is_inside(shape, error_set.shapes[0]))
         self.first = first
-        # Next to that of others, the deviation of a state that nothing disturbs would become smaller for ever, and all
-        # would where nothing disturbs any: covariances would not recur. Deviations are no smaller than this share of
-        # the largest one, each in units of what the certified set allows.
+        # Deviations of states that nothing disturbs would become smaller for ever, and covariances would not recur:
+        # they are no smaller than this share of the largest one, each in units of what the certified set allows.
         self._share, self._units = 2.0 ** -(covariance_bits + 4), np.sqrt(np.diag(error_set.shapes[0]))
 
     def predicted(self, statistics: ErrorStatistics) -> ErrorStatistics:
@@ -115,10 +108,9 @@ class ErrorRecursion:
         """Returns the gain T, shape (n, p), of x_hat + T (y - H x_hat), and the statistics after that update.
 
         It is the first gain whose ellipsoid lies inside the certified set of age 0: the Kalman gain, the set-membership
-        one, under a contract the certified one of the estimate's age, which (C2) maps into the set, and that of the way
-        back, which reaches least far out of the set. The certified one comes before that since its shapes recur. After
-        an outage no ellipsoid lies inside at first, and the way back is taken. Without a contract the sample must not
-        be used then, which None says.
+        one, under a contract the certified one of the estimate's age, which (C2) maps into the set. If none does, it is
+        that of the way back, which reaches least far out of the set; without a contract the sample must not be used
+        then, which None says.
         """
         covariance, shape, age, _ = statistics
         certified = self.error_set
@@ -142,17 +134,14 @@ class ErrorRecursion:
         return gain, ErrorStatistics(covariance, updated, 0, inside)
 
     def prefers(self, replayed: ErrorStatistics, present: ErrorStatistics) -> bool:
-        """Returns whether a replayed history is better than the present one.
-
-        Under a contract the sets depend on the age, and a newer sample must count.
-        """
+        """Returns whether a replayed history is better than the present one; under a contract a newer sample counts."""
         if self.error_set.contract is not None and replayed.age < present.age:
             return True
         weight = self.plant.weight
         return bool(np.vdot(weight, replayed.shape) <= np.vdot(weight, present.shape))
 
     def _kalman_update(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Returns gain and covariance of the Kalman filter; None if it is too ill-conditioned (after a long outage)."""
+        """Returns gain and covariance of the Kalman filter; None if it is too ill-conditioned."""
         try:
             gain, covariance = updated_covariance(covariance, self.plant.H, self.R)
         except np.linalg.LinAlgError:
@@ -170,7 +159,7 @@ class ErrorRecursion:
 def _rounded(covariance: np.ndarray, bits: int, smallest: np.ndarray) -> np.ndarray:
     """Returns a covariance whose Cholesky factor has some bits only, relative to powers of two near the deviations.
 
-    Deviations are at least the `smallest`, shape (n,), but of states that are known exactly: those stay known.
+    Deviations are at least the `smallest`, shape (n,), but of states that are known exactly.
     """
     if not covariance.diagonal().all():
         uncertain = np.flatnonzero(covariance.diagonal())
@@ -188,7 +177,7 @@ def _rounded(covariance: np.ndarray, bits: int, smallest: np.ndarray) -> np.ndar
 
 
 def _sensor_covariance(plant: LinearPlant, quantization_step: float) -> np.ndarray:
-    """Returns R, shape (p, p): the plant's for this purpose plus q^2/12 of a quantizer, invertible."""
+    """Returns R, shape (p, p), with q^2/12 of a quantizer, invertible."""
     R = plant.kalman_covariances[1] + quantization_step**2 / 12.0 * np.eye(plant.p)
     scale = np.sqrt(np.diag(R))
     # Of perfect sensors the innovation covariance stays invertible.

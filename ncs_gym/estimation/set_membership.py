@@ -11,8 +11,7 @@ from ncs_gym.uncertainty.shape_matrices import is_inside, outer_sum
 
 # Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `enlarged_by_rounding`).
 ROUNDING = 1e-13
-# Shapes are rounded up to multiples of this in coordinates where the certified set of age 0 is the unit ball: then they
-# recur when an arrival history does, and can be looked up.
+# Shapes are rounded up to multiples of this where the certified set of age 0 is the unit ball, so that they recur.
 SHAPE_STEP = 2.0**-13
 # Multipliers mu that the set-membership gain is chosen from; any of them is sound.
 MULTIPLIERS = np.linspace(0.01, 0.99, 99)[:, None]
@@ -28,7 +27,6 @@ class SetMembership:
         shape_step: What shapes are rounded up to, as a fraction of the certified set's square extent.
 
     Attributes:
-        shape_step: The same.
         noise: N, shape (p, p): holds sensor noise and quantization error.
     """
 
@@ -54,17 +52,12 @@ class SetMembership:
         self._largest_extent = (2.0 * plant.state_limit) ** 2
 
     def predicted(self, shape: np.ndarray, age: int) -> np.ndarray:
-        """Returns the shape one step later, without a sample, shape (n, n).
+        """Returns the shape one step after Sigma_k, (n, n), without a sample, given the age of the newest one.
 
         It is the first of these that lies inside the set of the next age: A Sigma_k A'/lam + D/(1-lam) with the
-        trace-optimal lam, the same with the certified rate, the certified set itself. That one is sound if E(Sigma_k)
-        lies inside the set of its own age, which (E1) or (C1) maps into it. If none does, lam is chosen for the way
-        back: the shape reaches least far out of the set. Beyond the contract no set is certified; the trace-optimal
-        shape still holds the error.
-
-        Args:
-            shape: Sigma_k, shape (n, n).
-            age: Steps since the newest sample used was taken.
+        trace-optimal lam, the same with the certified rate, the certified set itself, if E(Sigma_k) lies inside the set
+        of its own age, which (E1) or (C1) maps into it. If none does, lam is chosen for the way back: the shape reaches
+        least far out of the set. Beyond the contract it is the trace-optimal shape.
         """
         A, D, certified = self.plant.A, self.plant.disturbance.shape_matrix, self.error_set.shape_at(age + 1)
         extent = self._abs_A.dot(np.sqrt(shape.diagonal()))
@@ -87,15 +80,12 @@ class SetMembership:
         return self._bounded(self.rounded_up(shapes[best]) if best else predicted)
 
     def _bounded(self, shape: np.ndarray) -> np.ndarray:
-        """Returns a shape, or one around all differences of states that do not lie beyond `plant.state_limit`."""
+        """Returns a shape, or one around all differences of states within `plant.state_limit`."""
         limit = self._largest_extent
         return shape if (np.diag(shape) <= limit).all() else self.plant.n * np.diag(limit)
 
     def updated(self, shape: np.ndarray, gain: np.ndarray, mu: float | None = None) -> np.ndarray:
-        """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu): sound for any gain T, (n, p), and any mu.
-
-        By default mu is the trace-optimal one.
-        """
+        """Returns (I-TH) Sigma_k (I-TH)'/mu + T N T'/(1-mu), sound for any T, (n, p); mu is trace-optimal if None."""
         kept = self._identity - gain.dot(self.plant.H)
         size = np.abs(gain)
         extent = np.sqrt(shape.diagonal())
@@ -160,19 +150,15 @@ class SetMembership:
 
 
 def _least_reach(shapes: np.ndarray) -> int:
-    """Returns which shape, of (k, n, n), has the smallest largest eigenvalue."""
+    """Returns which of the shapes, (k, n, n), has the smallest largest eigenvalue."""
     return int(np.argmin(np.linalg.eigvalsh(shapes)[:, -1]))
 
 
 def enlarged_by_rounding(product: np.ndarray, extent: np.ndarray) -> np.ndarray:
-    """Returns a computed F S F', symmetric and enlarged by its rounding in whatever units.
+    """Returns a computed F S F', symmetric and enlarged by its rounding, given a = |F| sqrt(diag S), shape (n,).
 
-    With a = |F| sqrt(diag S) entry (i, j) is off by at most c eps a_i a_j, c of the order of n, and by Cauchy-Schwarz
-    such a matrix is at most n c eps diag(a^2). The few roundings of what follows are covered by D's own inflation.
-
-    Args:
-        product: F S F' as computed, shape (n, n).
-        extent: a, shape (n,).
+    Entry (i, j) is off by at most c eps a_i a_j, c of the order of n, and by Cauchy-Schwarz such a matrix is at most
+    n c eps diag(a^2). The few roundings of what follows are covered by D's own inflation.
     """
     size = len(extent)
     product = 0.5 * (product + product.T)

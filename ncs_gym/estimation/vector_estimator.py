@@ -19,11 +19,6 @@ from ncs_gym.validation import frozen
 class VectorEstimator(PastSteps):
     """What `Estimator` does, for N environments.
 
-    Args:
-        plant: The plant.
-        histories: The graph of arrival histories, shared with all other estimators of the plant and channel.
-        size: N.
-
     Attributes:
         alarm: Whether a measurement contradicted the assumed bounds in the episode, shape (N,).
         damaged: Whether one was no finite numbers, which the environment sees, shape (N,).
@@ -74,12 +69,7 @@ class VectorEstimator(PastSteps):
             self._replay()
 
     def numbered(self, inputs: Sequence[np.ndarray], chosen: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Returns estimates, (n, N), and numbers of error statistics, (N,), after the next steps.
-
-        Args:
-            inputs: The inputs of these steps, shape (m, N) each.
-            chosen: Indices of the environments that count, all by default.
-        """
+        """Returns estimates, (n, N), and numbers of statistics, (N,), of those chosen after steps with inputs."""
         mean, statistics = self.mean, self.statistics
         if chosen is not None:
             mean, statistics, inputs = mean[:, chosen], statistics[chosen], [u[:, chosen] for u in inputs]
@@ -95,11 +85,11 @@ class VectorEstimator(PastSteps):
         where: np.ndarray | None = None,
         age: int | None = None,
     ) -> np.ndarray:
-        """Returns the histories, shape (N,), that some lead to; entries of the table that are unknown are worked out.
+        """Returns the histories, shape (N,), that some lead to by an array of `ArrivalHistories`.
 
         Args:
             history: Where to go from, shape (N,).
-            table: Name of one of the arrays of `ArrivalHistories`.
+            table: Name of the array.
             work_out: Called with the number of a history whose entry is missing.
             where: Which environments move, shape (N,); all by default.
             age: Of the samples that arrive, if any.
@@ -120,7 +110,7 @@ class VectorEstimator(PastSteps):
     def _replay(self) -> None:
         """Replays from the oldest new sample on, and keeps whichever history is better.
 
-        Environments without new samples are carried along: they use no sample and keep what they have.
+        Environments without new samples use none and keep what they have.
         """
         target = self._follow(self.history, "target", self.histories.after_replay)
         histories, H = self.histories, self.plant.H
@@ -145,12 +135,7 @@ class VectorEstimator(PastSteps):
         self.history = target
 
     def _monitor(self, residual: np.ndarray, statistics: np.ndarray) -> None:
-        """Latches the alarm of environments whose residual no error and no noise within their bounds explain.
-
-        Args:
-            residual: y - H x_hat, shape (p, N).
-            statistics: Numbers of the statistics before the update, shape (N,); NO_SAMPLE where there is none.
-        """
+        """Latches the alarm of environments whose residual, shape (p, N), no error and noise within bounds explain."""
         table = self.histories.table
         weights = table.quick_tests.take(statistics, axis=2)
         quick = np.einsum("ik,ijk,jk->k", residual, weights, residual)

@@ -1,7 +1,7 @@
 """The safe box between two sampling instants, on a grid of times (docs/shield_proof.md, "Between the samples").
 
 With the input held, x(tau) = A_tau x + B_tau u + d_tau, where [A_tau, B_tau] is the upper part of exp(G tau) for
-G = [[Ac, Bc], [0, 0]] of the model x' = Ac x + Bc u + w in continuous time.
+G = [[Ac, Bc], [0, 0]].
 """
 
 from __future__ import annotations
@@ -14,26 +14,22 @@ import numpy as np
 from ncs_gym import exact
 from ncs_gym.bounds import Bounds
 from ncs_gym.limits import Limits
-from ncs_gym.model import Model, zero_order_hold
+from ncs_gym.model import Model
 from ncs_gym.plants.hard_bounds import HardBounds
 from ncs_gym.validation import read_only, setting
 
-# A and B of a plant are those of its model in continuous time up to this, relative to the largest entry in units of the
-# limits.
-SAME_MODEL = 1e-9
-# What the bound between grid points is enlarged by, relative to itself and to what a row reaches: for the rounding of
-# the rows, which the verification of a certificate bounds.
+# What the bound between grid points gains for the rounding of rows, relative to itself and to what a row reaches.
 MARGIN, ROUNDING = 0.01, 1e-12
 
 
 class GridRows(NamedTuple):
-    """What the rows c of the safe box say about x and u at the times tau_i = i dt / N of a step, i = 0..N-1.
+    """The rows c of the safe box as rows on x and u at the times tau_i = i dt / N of a step, i = 0..N-1.
 
     Attributes:
-        state: c A_tau, shape (N, k, n); those of i = 0 are the rows themselves.
+        state: c A_tau, shape (N, k, n).
         input: c B_tau, shape (N, k, m).
-        remainder: eta, shape (k,): while x is in the box and u within its limits, c (A_tau x + B_tau u) is nowhere
-            beyond its values at the two grid points around tau by more than this, the rounding of the rows included.
+        remainder: eta, shape (k,): for x in the box and u within its limits, c (A_tau x + B_tau u) is nowhere beyond
+            its values at the two grid points around tau by more than this, the rounding of the rows included.
     """
 
     state: np.ndarray
@@ -45,11 +41,9 @@ class BetweenSamples(HardBounds):
     """What the limits say of times between samples.
 
     Attributes:
-        model, limits, bounds: What all follows from.
-        dt: Duration of a step [s].
         state_names, state_units, input_names, input_units: The labels, with defaults.
-        continuous_model: [Ac, Bc] that A and B were sampled from, shape (n, n + m); None if unknown.
-        between_samples: Number of times per step at which the box counts; None for the sampling instants alone.
+        dt, continuous_model: Those of the model.
+        between_samples: That of the limits.
     """
 
     model: Model
@@ -65,15 +59,14 @@ class BetweenSamples(HardBounds):
 
     @cached_property
     def grid_rows(self) -> GridRows | None:
-        """What the box says of states and inputs between samples; None if only the sampling instants count.
+        """What the box says between samples, the same on every machine; None if only the sampling instants count.
 
-        Every number is the same on every machine. Between two grid points a function leaves its linear interpolation by
-        at most h^2/8 times its largest second derivative, here [c, 0] G^2 exp(G tau) (x, u). In the norm |q|_W =
-        sum |q_j| W_j, with W the largest |x_j| and |u_j|, that grows from one grid point to the next by at most
-        exp(h m), m the logarithmic norm of G.
+        Between two grid points a function leaves its linear interpolation by at most h^2/8 times its largest second
+        derivative, here [c, 0] G^2 exp(G tau) (x, u). In the norm |q|_W = sum |q_j| W_j, with W the largest |x_j| and
+        |u_j|, that grows from one grid point to the next by at most exp(h m), m the logarithmic norm of G.
 
         Raises:
-            OverflowError: If it is out of reach of float64, which the message says.
+            OverflowError: If it is out of reach of float64.
         """
         model, points = self.continuous_model, self.between_samples
         if points is None:
@@ -98,8 +91,7 @@ class BetweenSamples(HardBounds):
     def _rows_within_step(self) -> np.ndarray | None:
         """Rows on (x, u, x+) that are c x(tau_i), i = 1..N-1, shape ((N - 1) k, 2 n + m); None as of `grid_rows`.
 
-        What a disturbance did to the step, d = x+ - A x - B u, has come in proportion to the time: d_tau = (tau / dt)
-        d, which lies in E(D) as d does.
+        What a disturbance did has come in proportion to the time: d_tau = (tau / dt) (x+ - A x - B u) is in E(D), too.
         """
         if (rows := self.grid_rows) is None:
             return None
@@ -110,13 +102,7 @@ class BetweenSamples(HardBounds):
     def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
         """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
 
-        Shape (k + q,) or (k + q, N). With `between_samples` at these times of the step, what moved x+ away from A x + B
-        u in proportion to the time; else at its end alone.
-
-        Args:
-            state: x at the beginning, shape (n,) or (n, N).
-            u: Input that was held, shape (m,) or (m, N).
-            x_next: x+, of the shape of x.
+        Shape (k + q,) or (k + q, N), for x, x+ of shape (n,) or (n, N) and the input that was held, (m,) or (m, N).
         """
         values, rows = self.constraint_values(x_next), self._rows_within_step
         if rows is not None:
@@ -126,25 +112,13 @@ class BetweenSamples(HardBounds):
         return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values
 
     def _check_between_samples(self) -> None:
-        """Raises ValueError unless the model in continuous time is one, and there if times between samples count."""
-        continuous, model = self.continuous_model, self.model
-        if continuous is not None:
-            n, widths = len(model.A), np.concatenate([self.half_widths[: len(model.A)], self.input_half])
-            sampled = np.hstack(zero_order_hold(continuous[:, :n], continuous[:, n:], self.dt))
-            sampled, given = (each * widths / widths[:n, None] for each in (sampled, np.hstack([model.A, model.B])))
-            if not (np.abs(sampled - given) <= SAME_MODEL * np.abs(given).max()).all():
-                raise ValueError(
-                    "continuous of the Model is not the one that A and B were sampled from: make it by Model.sampled, "
-                    "or give continuous=None"
-                )
+        """Raises ValueError if times between samples count of which nothing is known."""
         if self.between_samples is None:
             return
         has_remainder = any(each.is_left_out for each in self.bounds.disturbance.parts)
-        if continuous is None or self.past or has_remainder or self.step_offset.any():
-            raise ValueError(
-                "between_samples needs a model that Model.sampled made, without delays, limits of rates and remainder, "
-                "at a point that rests without a constant disturbance: else nothing is known of times within a step"
-            )
+        if self.continuous_model is None or self.past or has_remainder or self.step_offset.any():
+            needed = "a model of Model.sampled, without delays, rates, remainder and constant disturbance"
+            raise ValueError(f"between_samples needs {needed}: else nothing is known of times within a step")
         if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
             raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")
 

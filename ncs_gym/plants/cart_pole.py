@@ -10,8 +10,7 @@ from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
 
 GRAVITY = 9.81
-# Bounds on disturbance and sensor noise as fractions of the half-widths of the box; no gamma, so that every state has
-# its own scale.
+# Bounds on disturbance and sensor noise as fractions of the half-widths of the box.
 DISTURBANCE_FRACTION = 1.2e-3
 SENSOR_FRACTION = 1e-4
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from textwrap import fill
 
 import numpy as np
@@ -15,13 +16,12 @@ _INDENT, _WIDTH = 16, 80
 _ZERO = 1e-12
 # Stands for a space at which no line ends.
 _UNBROKEN = "\N{NO-BREAK SPACE}"
-# What a plant without each kind of uncertainty assumes, and what its Gaussian noise is called.
 _WITHOUT = ("no disturbance acts on the plant", "the sensors measure without noise", "the first estimate is exact")
 _NOISES = ("disturbances", "sensor noise", "the first error")
 
 
 def described(plant: BetweenSamples) -> str:
-    """Returns the limits, the bounds and the assumptions of a plant for people, with units."""
+    """Returns limits, bounds and assumptions for people, with units."""
     sizes = ", ".join(counted(*each) for each in ((plant.n, "state"), (plant.m, "input"), (plant.p, "output")))
     radius = f"spectral radius {plant.spectral_radius:.6g}"
     unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
@@ -40,9 +40,10 @@ def described(plant: BetweenSamples) -> str:
         lines["safe box"].append(f"at all times: at {plant.between_samples} of each step, and bounded between them")
     own = plant.n - plant.past  # past inputs are known, and their rows limit nothing: inputs have limits
     states = plant.state_names[:own], plant.state_units[:own]
+    outputs = of_outputs(plant.H, plant.state_names), of_outputs(plant.H, plant.state_units, "")
     for title, bound, (names, units) in (
         ("disturbance", plant.disturbance, states),
-        ("sensor noise", plant.sensor_error, outputs_of(plant)),
+        ("sensor noise", plant.sensor_error, outputs),
         ("first error", plant.initial_error, states),
     ):
         extents = zip(names, np.sqrt(np.diag(bound.shape_matrix)), units, strict=False)
@@ -58,7 +59,7 @@ def described(plant: BetweenSamples) -> str:
 
 
 def assumptions_of(plant: BetweenSamples) -> tuple[str, ...]:
-    """Returns what is assumed of everything uncertain about a plant."""
+    """What a certificate takes for granted beyond numbers, in sentences."""
     held = plant.nominal_disturbance, plant.nominal_sensor_error, plant.nominal_initial_error
     without = zip(_WITHOUT, held, strict=True)
     assumed = [f"It is assumed that {text}." for text, each in without if not each.shape_matrix.any()]
@@ -74,28 +75,20 @@ def assumptions_of(plant: BetweenSamples) -> tuple[str, ...]:
 
 
 def row_limit(plant: BetweenSamples, j: int) -> str:
-    """Returns what limit j says: of those of the safe box, of the inputs, and of both together.
-
-    That of a sum is in units of its largest entry.
-    """
+    """Returns what limit j of the safe box, the inputs and both together says; that of a sum in its largest entry."""
     n, m = plant.n, plant.m
     rows = [np.pad(plant.box, ((0, 0), (m, 0))), np.eye(m, m + n), np.roll(plant.mixed_rows, m, axis=1)]
     ends = np.concatenate([plant.box_ends, plant.input_ends, plant.mixed_ends], axis=1)
     row, names = np.concatenate(rows)[j], plant.input_names + plant.state_names
     limited, center = np.flatnonzero(row).tolist(), np.concatenate([plant.operating_input, plant.operating_state])
+    size, unit = np.abs(row).max(), ""
     if len(limited) == 1:
-        size, name, unit = row[limited[0]], names[limited[0]], (plant.input_units + plant.state_units)[limited[0]]
-    else:
-        size, unit = np.abs(row).max(), ""
-        terms = [f"{'-' if row[i] < 0.0 else '+'} {_factor(abs(row[i]) / size)}{names[i]}" for i in limited]
-        name = " ".join(terms).removeprefix("+ ")
-        name = f"-{name[2:]}" if name.startswith("- ") else name
-    low, high = sorted((ends[:, j] / size).tolist())
-    return _between(name, low, high, float(row @ center / size), unit)
-
-
-def _between(name: str, low: float, high: float, center: float, unit: str) -> str:
-    """Returns the limits of a quantity, given its ends from the operating point and that point."""
+        size, unit = row[limited[0]], (plant.input_units + plant.state_units)[limited[0]]
+    factors = [(row[i] / size, names[i]) for i in limited]
+    terms = [f"{'-' if each < 0.0 else '+'} {_factor(abs(each))}{name}" for each, name in factors]
+    name = " ".join(terms).removeprefix("+ ")
+    name = f"-{name[2:]}" if name.startswith("- ") else name
+    (low, high), center = sorted((ends[:, j] / size).tolist()), float(row @ center / size)
     farthest = max((abs(end) for end in (low, high) if abs(end) < np.inf), default=np.inf)
     center = 0.0 if abs(center) <= _ZERO * farthest else center
     if center == 0.0 and low == -high:
@@ -117,12 +110,7 @@ def _factor(size: float) -> str:
     return "" if size == 1.0 else f"{size:.4g} "
 
 
-def outputs_of(plant: BetweenSamples) -> tuple[list[str], list[str]]:
-    """Returns the names and units of the outputs: those of the states that are measured alone, else y1, y2."""
-    names, units = [], []
-    for j, row in enumerate(plant.H):
-        measured = np.flatnonzero(row)
-        alone = len(measured) == 1 and row[measured[0]] == 1.0
-        names.append(plant.state_names[measured[0]] if alone else f"y{j + 1}")
-        units.append(plant.state_units[measured[0]] if alone else "")
-    return names, units
+def of_outputs(H: np.ndarray, of_states: Sequence[str], otherwise: str = "y{}") -> list[str]:
+    """Returns names, or units, of outputs: those of states that are measured alone, else y1, y2, ..."""
+    alone = (np.abs(H).sum(axis=1) == 1.0) & (H.max(axis=1) == 1.0)
+    return [str(of_states[row.argmax()]) if alone[j] else otherwise.format(j + 1) for j, row in enumerate(H)]

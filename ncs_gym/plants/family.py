@@ -1,9 +1,8 @@
 """The plant of the middle of a family of plants, with a proved bound on what it leaves out of each of them.
 
-For x in the safe box and u within the limits, what the middle (A, B) leaves out of a member, (A_i - A) x + (B_i - B) u
-+ s_i, is at most sum_j |[A_i - A, B_i - B]|_j w_j + |s_i|, entry by entry, with w the largest |x_j| and |u_j|, and s_i
-the step of a member that rests elsewhere from the middle of the operating points. It is linear in the member, so a
-bound for some members is one for their convex hull (docs/shield_proof.md, "Plants that vary").
+For x and u within the limits, what the middle (A, B) leaves out of a member, (A_i - A) x + (B_i - B) u + s_i, is at
+most sum_j |[A_i - A, B_i - B]|_j w_j + |s_i|, entry by entry, with w the largest |x_j| and |u_j|, and s_i the step of a
+member that rests elsewhere. That is linear in the member (docs/shield_proof.md, "Plants that vary").
 """
 
 from __future__ import annotations
@@ -60,52 +59,44 @@ def family(
     that vary"). An environment draws a member for every episode; what the bound allows is not drawn beside.
 
     Args:
-        members: Two plants or more that differ in A and B alone, and in where they rest, whose convex hull is
-            covered: the vertices. Or a function of parameters given by name that returns such plants. Deviations
-            of the middle are counted from the middle of their operating points.
+        members: Two plants or more that differ in A and B alone, and in where they rest, whose convex hull is covered;
+            or a function of parameters given by name that returns such plants. Deviations of the middle are counted
+            from the middle of their operating points.
         ranges: Lowest and highest value of each parameter of the function, up to 6 of them.
-        monotone: Whether every entry of A and B is monotone in each parameter while the others stay, anywhere in
-            the ranges. That is yours to prove; it bounds the entries by those of the corners, and is checked on a
-            grid. Needed for a function. Where members rest at different points, it is also about A x + B u + c - x
-            at the middle of these.
-        at_rest: Whether every member is at rest at its own operating point, with c as `offset` in absolute
-            coordinates: A x + B u + c = x. Needed where members differ in what acts on operating points that are
-            not zero; a model of deviations does not say it.
+        monotone: Your claim, needed for a function and checked on a grid, that every entry of A and B, and of
+            A x + B u + c - x at the middle of the operating points, is monotone in each parameter.
+        at_rest: Your claim that every member rests at its own operating point, A x + B u + c = x with c its `offset`;
+            needed where members differ in what acts on operating points that are not zero.
 
     Raises:
-        ValueError: If members differ in anything else, are proved between samples or have a remainder, a claim of
-            monotone entries is contradicted or missing, a state that matters has no limit, or an argument is wrong.
+        ValueError: If members differ in anything else, are proved between samples or have a remainder, a claim is
+            contradicted or missing, a state that matters has no limit, or an argument is wrong.
     """
     at_rest, monotone = as_flag(at_rest, "at_rest"), as_flag(monotone, "monotone")
     if callable(members):
-        found, plants = _of_function(members, ranges, monotone)
+        found, plants, shared = _of_function(members, ranges, monotone)
     elif ranges is None and not monotone:
-        found, plants = _of_plants(members)
+        found, plants, shared = _of_plants(members)
     else:
         raise ValueError("ranges and monotone are about a function of parameters: give a function in place of plants")
-    rest_matters = _rest_matters(found, plants)
+    differs = np.ptp(found.members[..., :-1], axis=0).any(axis=0)
+    rest_matters = bool(np.any(_resting_points(plants)[:, differs]))
     if rest_matters and not at_rest:
         raise ValueError(
-            "the members differ in what acts on an operating point that is not zero (the middle of a disturbance with "
-            "two ends moves it, too): say at_rest=True if each is at rest at its own one, as Model(offset=...) checks "
-            "of a model in absolute coordinates"
+            "the members differ in what acts on an operating point that is not zero: say at_rest=True if each is at "
+            "rest at its own one, as Model(offset=...) checks"
         )
-    first, n = _around_center(plants[0], _center_of(plants)), len(plants[0].model.A)
+    first, n = shared.first, len(plants[0].model.A)
     own = np.array([np.hstack([each.model.A, each.model.B]) for each in plants])
     middle = 0.5 * (own.min(axis=0) + own.max(axis=0))  # exact where all are the same
     model = replace(first.model, A=middle[:, :n], B=middle[:, n:], offset=None, continuous=None)
-    bounds, cover = first.bounds, _covering(plants)
-    if cover is not first.disturbance_bound:
-        bounds = _with_bound(first, cover)
+    bounds = first.bounds if shared.cover is first.disturbance_bound else _with_bound(first, shared.cover)
     remainder = Remainder(Ellipsoid(np.zeros((n, n))), True, "", replace(found, at_rest=rest_matters))
     return LinearPlant(model, first.limits, replace(bounds, disturbance=bounds.disturbance + remainder), first.labels)
 
 
 def _with_bound(plant: LinearPlant, bound: Ellipsoid | None) -> Bounds:
-    """Returns the bounds of a plant with another ellipsoid, (n, n), in place of what its own one holds.
-
-    That is all but a Gaussian, and but balls where no past inputs are (`source_of`).
-    """
+    """Returns the bounds of a plant with another ellipsoid, (n, n), in place of its `disturbance_bound`."""
     kinds = Gaussian if plant.past else Ball | Gaussian
     kept = [each for each in plant.bounds.disturbance.parts if isinstance(each, kinds)]
     n = len(plant.model.A)
@@ -113,19 +104,12 @@ def _with_bound(plant: LinearPlant, bound: Ellipsoid | None) -> Bounds:
     return replace(plant.bounds, disturbance=Sum((*kept, *others)))
 
 
-def _rest_matters(family: Family, plants: list[LinearPlant]) -> bool:
-    """Returns whether members differ in what acts on their operating points."""
-    differs = np.ptp(family.members[..., :-1], axis=0).any(axis=0)
-    return bool(np.any(_resting_points(plants)[:, differs]))
-
-
 def _resting_points(plants: list[LinearPlant]) -> np.ndarray:
-    """Returns state and input that the deviations of each are counted from, shape (N, n + m)."""
+    """Returns the operating states and inputs, shape (N, n + m)."""
     return np.array([np.concatenate([each.operating_state, each.operating_input]) for each in plants])
 
 
 def _center_of(plants: list[LinearPlant]) -> np.ndarray:
-    """Returns state and input in the middle of the operating points, shape (n + m,)."""
     points = _resting_points(plants)
     return 0.5 * (points.min(axis=0) + points.max(axis=0))  # exact where all are the same
 
@@ -145,9 +129,8 @@ def _around_center(plant: LinearPlant, center: np.ndarray) -> LinearPlant:
 def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
     """Returns a bound of the disturbances of all members, the one of the first if all have the same by themselves.
 
-    What members that rest under a constant disturbance lack of an equilibrium by rounding is part of their bounds, and
-    is less than SAME_BOUND of the terms of a step. P_i <= P_0 + diag(row sums of |P_i - P_0|), as `_is_covered`
-    compares.
+    What members that rest under a constant disturbance lack of an equilibrium is part of their bounds, and less than
+    SAME_BOUND of the terms of a step. P_i <= P_0 + diag(row sums of |P_i - P_0|), as `_is_covered` compares.
     """
     first = plants[0]
     shape = _disturbance_shape(first)
@@ -160,7 +143,7 @@ def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
 
 
 def _is_covered(first: LinearPlant, cover: Ellipsoid | None, plant: LinearPlant) -> bool:
-    """Returns whether the bound of a member's disturbance is inside of the bound of the family's."""
+    """Returns whether the bound of a member's disturbance is inside of the family's."""
     off = np.abs(_disturbance_shape(plant) - _disturbance_shape(first))
     widths = _terms(first)
     excess = (off / (widths * widths[:, None])).sum(axis=1) * widths**2
@@ -179,30 +162,27 @@ def _terms(plant: LinearPlant) -> np.ndarray:
     return reach[: plant.n] + exact.product(np.abs(np.hstack([plant.A, plant.B])), reach)
 
 
-def _of_plants(members: Any) -> tuple[Family, list[LinearPlant]]:
-    """Returns the family of plants, and the plants."""
+def _of_plants(members: Any) -> tuple[Family, list[LinearPlant], _Shared]:
+    """Returns the family of plants, these, and what they share."""
     if not isinstance(members, (list, tuple)) or len(members) < 2:
-        raise ValueError(
-            f"a family must be a list of two plants or more, or a function of ranges, got {shown(members)}"
-        )
+        raise ValueError(f"a family must be two plants or more, or a function of ranges, got {shown(members)}")
     plants = list(members)
-    _require_alike(plants)
-    center, matrices = _center_of(plants), _matrices(plants)
-    family = Family(names=("member",), parameters=np.arange(len(plants))[:, None], members=matrices, center=center)
-    return family, plants
+    shared, numbers = _Shared.of(plants), np.arange(len(plants))[:, None]
+    family = Family(names=("member",), parameters=numbers, members=_matrices(plants), center=_center_of(plants))
+    return family, plants, shared
 
 
-def _of_function(function: Callable[..., LinearPlant], ranges: Any, monotone: bool) -> tuple[Family, list[LinearPlant]]:
-    """Returns the family of a function, and the plants of its corners."""
+def _of_function(
+    function: Callable[..., LinearPlant], ranges: Any, monotone: bool
+) -> tuple[Family, list[LinearPlant], _Shared]:
+    """Returns the family of a function, the plants of its corners, and what they share."""
     if not isinstance(ranges, Mapping) or not 1 <= len(ranges) <= MOST_PARAMETERS:
-        raise ValueError(
-            f"ranges must be a dictionary of 1 to {MOST_PARAMETERS} parameters with their (low, high), got "
-            f"{shown(ranges)}"
-        )
+        form = f"a dictionary of 1 to {MOST_PARAMETERS} parameters with their (low, high)"
+        raise ValueError(f"ranges must be {form}, got {shown(ranges)}")
     if not monotone:
         raise ValueError(
-            "between the ends of the ranges the plants of a function may be anything: say monotone=True if every entry "
-            "of A and B is monotone in each parameter, or give the list of plants whose convex hull holds yours"
+            "say monotone=True if every entry of A and B is monotone in each parameter, or give plants whose convex "
+            "hull holds yours"
         )
     names = as_names(list(ranges), tuple(map(str, ranges)), "the names of parameters")
     ends = [sides(value, 1, f"the range of {name}").ravel() for name, value in ranges.items()]
@@ -210,14 +190,12 @@ def _of_function(function: Callable[..., LinearPlant], ranges: Any, monotone: bo
         raise ValueError(f"the ends of ranges must be finite, got {shown(ranges)}")
     corners = [np.array(corner) for corner in itertools.product(*ends)]
     plants = [function(**dict(zip(names, corner.tolist(), strict=True))) for corner in corners]
-    _require_alike(plants)
-    matrices = _matrices(plants)
+    shared, matrices = _Shared.of(plants), _matrices(plants)
     varies = np.ptp(matrices, axis=0).any(axis=1)  # other rows, as those of past inputs, are the same everywhere
     reach = np.max([each.reach for each in plants], axis=0)
     room = ROOM * (varies * np.abs(matrices[..., :-1]).max(axis=(0, 2)))[:, None] * np.isfinite(reach)
     room = np.column_stack([room, ROOM * _terms_of_step(plants, matrices)])
     interval = np.array([matrices.min(axis=0) - room, matrices.max(axis=0) + room])
-    first, cover = _around_center(plants[0], _center_of(plants)), _covering(plants)
     family = Family(
         names=names,
         parameters=np.array(corners),
@@ -225,14 +203,14 @@ def _of_function(function: Callable[..., LinearPlant], ranges: Any, monotone: bo
         function=function,
         interval=interval,
         center=_center_of(plants),
-        check=_Shared(first, cover, "one inside the ranges"),
+        check=shared,
     )
     _check_monotone(family, room)
-    return family, plants
+    return family, plants, shared
 
 
 def _matrices(plants: list[LinearPlant]) -> np.ndarray:
-    """Returns [A, B, s] of plants around the middle of their operating points, shape (N, n, n + m + 1)."""
+    """Returns [A, B, s] of each around the middle of their operating points, shape (N, n, n + m + 1)."""
     shape = plants[0].n, plants[0].n + plants[0].m + 1
     return np.array([matrices_of(each, shape, _center_of(plants)) for each in plants])
 
@@ -244,41 +222,33 @@ def _terms_of_step(plants: list[LinearPlant], matrices: np.ndarray) -> np.ndarra
     return np.max(terms, axis=0) * (np.arange(n) < n - plants[0].past)
 
 
-def _require_alike(plants: list[LinearPlant]) -> None:
-    """Raises ValueError unless all are plants that differ in A and B alone, and in where they rest."""
-    for each in plants:
-        _require_member(plants[0], each)
-    first, cover = _around_center(plants[0], _center_of(plants)), _covering(plants)
-    for number, each in enumerate(plants):
-        _Shared(first, cover, f"member {number}")(each)
-
-
 def _require_member(first: LinearPlant, plant: Any) -> None:
     """Raises ValueError unless a plant can be a member of a family, and has the sizes of its first one."""
     if not isinstance(plant, LinearPlant) or plant.remainder is not None or plant.between_samples is not None:
-        raise ValueError(
-            "the members of a family must be plants without a remainder of their own and without between_samples, for "
-            f"which no bound of a family is proved, got {shown(plant)}"
-        )
+        form = "plants without a remainder of their own and without between_samples"
+        raise ValueError(f"the members of a family must be {form}, got {shown(plant)}")
     matrices_of(plant, (first.n, first.n + first.m + 1), np.zeros(plant.n + plant.m))
 
 
 @dataclass(frozen=True, eq=False)
 class _Shared:
-    """What all members share: that of the first one, counted from where the family rests.
-
-    Attributes:
-        first: The first member.
-        cover: The family's bound of disturbances.
-        name: What messages call another member.
-    """
+    """What members share: the first one, counted from where the family rests, and a bound of all disturbances."""
 
     first: LinearPlant
     cover: Ellipsoid | None
-    name: str
 
-    def __call__(self, plant: Any) -> None:
-        """Raises ValueError unless a plant, counted from where the first one is, has all that members share."""
+    @classmethod
+    def of(cls, plants: list[LinearPlant]) -> _Shared:
+        """Returns that of plants; raises ValueError unless they differ in A and B alone, and in where they rest."""
+        for each in plants:
+            _require_member(plants[0], each)
+        shared = cls(_around_center(plants[0], _center_of(plants)), _covering(plants))
+        for number, each in enumerate(plants):
+            shared(each, f"member {number}")
+        return shared
+
+    def __call__(self, plant: Any, called: str = "one inside the ranges") -> None:
+        """Raises ValueError unless a plant has what members share."""
         _require_member(self.first, plant)
         moved = _around_center(plant, _resting_points([self.first])[0])
         names = [
@@ -289,9 +259,7 @@ class _Shared:
         if not names and not _is_covered(self.first, self.cover, plant):
             names = ["Bounds(disturbance=...)"]
         if names:
-            raise ValueError(
-                f"the members of a family may differ in A and B alone, and {self.name} differs in {names[0]}"
-            )
+            raise ValueError(f"members of a family may differ in A and B alone, and {called} differs in {names[0]}")
 
 
 def _is_same(one: Any, other: Any, tolerance: float) -> bool:
@@ -302,11 +270,7 @@ def _is_same(one: Any, other: Any, tolerance: float) -> bool:
 
 
 def _check_monotone(family: Family, room: np.ndarray) -> None:
-    """Checks on a grid that entries are monotone up to `room`, shape (n, n + m + 1).
-
-    Raises:
-        ValueError: If an entry is not, with its name and that of the parameter.
-    """
+    """Raises ValueError unless entries are monotone up to `room`, shape (n, n + m + 1), on a grid."""
     k, (low, high) = len(family.names), family.ranges
     each = grid_size(k)
     points = np.array([*itertools.product(*np.linspace(low, high, each).T)])
@@ -316,7 +280,5 @@ def _check_monotone(family: Family, room: np.ndarray) -> None:
         both = np.any(change > room, axis=axis) & np.any(change < -room, axis=axis)
         wrong = np.array(both).reshape(-1, *room.shape).max(axis=0)
         if wrong.any():
-            raise ValueError(
-                f"{entry_name(wrong)} is not monotone in {name} from {low[axis]:g} to {high[axis]:g}, as monotone=True "
-                "says: give a smaller range, or the list of plants whose convex hull holds yours"
-            )
+            where = f"{name} from {low[axis]:g} to {high[axis]:g}"
+            raise ValueError(f"{entry_name(wrong)} is not monotone in {where}, as monotone=True says")

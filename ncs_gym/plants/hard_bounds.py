@@ -17,10 +17,9 @@ from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from ncs_gym.validation import read_only, setting
 
-# Relative growth of every hard bound, so that rounding in sampling and quantizing stays inside (docs/shield_proof.md).
-INFLATION = 1.0 + 1e-9
-# The same for directions in which a bound is flat: growth of its diagonal alone.
-FLAT_INFLATION = 1e-12
+# Relative growth of every hard bound for the rounding of sampling and quantizing (docs/shield_proof.md), and of its
+# diagonal, where it is flat.
+INFLATION, FLAT_INFLATION = 1.0 + 1e-9, 1e-12
 # No disturbance set is thinner than this, in squared half-widths of the safe box.
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
@@ -28,11 +27,11 @@ SIMULATED_REACH = 100.0
 
 
 class Source(NamedTuple):
-    """What is declared of one uncertainty, in the dimension of the plant: the sum of all.
+    """What is declared of one uncertainty, in the dimension of the plant: the sum of three.
 
     Attributes:
         ball: Squared radius of a ball.
-        noise: Truncated Gaussian noise, whose covariance is zero where there is none.
+        noise: Truncated Gaussian noise; without any its covariance is zero.
         bound: An ellipsoid around what else is declared; None if nothing is.
     """
 
@@ -47,11 +46,11 @@ class Source(NamedTuple):
         Args:
             declared: The sum.
             weight: W, by which a sum of several sets becomes one ellipsoid.
-            past: How many past inputs follow, of which nothing is uncertain.
+            past: How many past inputs, which are known, follow.
             keeps_ball: Whether a `Ball` stands for itself, which it cannot beside past inputs.
 
         Raises:
-            ValueError: If a set is in another dimension, or one with two different ends is added to others.
+            ValueError: If a set with two different ends is added to others.
         """
         size, gaussian = len(weight), declared.gaussian
         covariance, delta = (gaussian.covariance, gaussian.delta) if gaussian else (np.zeros((size, size)), DELTA)
@@ -65,7 +64,7 @@ class Source(NamedTuple):
         return cls(float(np.square(sum(each.radius for each in balls))), noise, bound)
 
     def bounded(self) -> list[Ellipsoid]:
-        """Returns the bounds of all but the noise, in dimension n."""
+        """Returns the bounds of all but the noise."""
         ball = Ellipsoid(self.ball * np.eye(len(self.noise.covariance)))
         return [ball, *([] if self.bound is None else [self.bound])]
 
@@ -79,7 +78,7 @@ class Source(NamedTuple):
         return np.sum([self.noise.covariance, *(each.shape_matrix / divisor for each in self.bounded())], axis=0)
 
     def drawn(self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True) -> np.ndarray:
-        """Returns noise, truncated or not, plus a uniform point of the bound unless that is one, (n,) or (count, n)."""
+        """Returns noise plus a uniform point of the bound unless that is one, shape (n,) or (count, n)."""
         samples = self.noise.sample(rng, count, truncated=truncated)
         if self.bound is None or not self.bound.shape_matrix.any():
             return samples
@@ -87,17 +86,13 @@ class Source(NamedTuple):
 
 
 class HardBounds(LimitValues):
-    """The bounds of disturbances, sensor noise and first estimates of a plant, by what is declared of them.
+    """The bounds of disturbances, sensor noise and first estimates of a plant.
 
     Attributes:
         n, m, p: Number of states, inputs and outputs.
-        of_disturbance, of_sensor, of_first_error: What is declared of each.
+        of_disturbance, of_sensor, of_first_error: What is declared of each; the attributes below name parts of these.
         remainder: What the model leaves out of the process that really moves; None if nothing.
         delta: Probability that Gaussian noise is truncated at.
-        gamma: Squared radius of the ball that disturbances add.
-        process_noise, sensor_noise, initial_noise: The truncated Gaussians, to which what lies in the next is added.
-        disturbance_bound, sensor_bound, initial_bound: What holds the rest of each; None if there is no other set.
-        process_noise_cov, measurement_noise_cov, initial_cov: Q, R and P0 of the Gaussians; zero where there is none.
     """
 
     n: int
@@ -121,7 +116,7 @@ class HardBounds(LimitValues):
 
     @cached_property
     def remainder_bound(self) -> Ellipsoid | None:
-        """What holds the remainder of a model, shape (n, n); None if there is none."""
+        """What holds the remainder, with past inputs."""
         return self.remainder and Ellipsoid(np.pad(self.remainder.bound.shape_matrix, (0, self.past)))
 
     @cached_property
@@ -131,7 +126,7 @@ class HardBounds(LimitValues):
 
     @cached_property
     def reach_from_rest(self) -> np.ndarray:
-        """How far inputs take each state in n steps at most, from about as far as noise does in one, shape (n,)."""
+        """How far inputs take each state in n steps, from about as far as noise does in one, shape (n,)."""
         sources = self.of_disturbance, self.of_first_error
         bounded = [each.shape_matrix for source in sources for each in source.bounded()]
         noise = [np.diag(each) for each in [*(source.noise.covariance for source in sources), *bounded]]
@@ -139,37 +134,35 @@ class HardBounds(LimitValues):
 
     @cached_property
     def _box_shape(self) -> np.ndarray:
-        """The inverse of `weight`, shape (n, n): that of the ellipsoid {x : x'Wx <= 1}."""
         return exact.inverse(self.weight)
 
     @cached_property
     def relative_weight(self) -> np.ndarray:
-        """W in units of its largest entry, shape (n, n): the identity exactly if the box is a cube."""
+        """W in units of its largest entry: the identity exactly if the box is a cube."""
         return read_only(self.weight / self.weight.max())
 
     @cached_property
     def half_widths(self) -> np.ndarray:
-        """Half-widths of the ellipsoid {x : x'Wx <= 1} around the safe box' center, shape (n,)."""
+        """Half-widths of the ellipsoid {x : x'Wx <= 1}, shape (n,)."""
         return read_only(np.sqrt(np.diag(self._box_shape)))
 
     @cached_property
     def disturbance(self) -> Ellipsoid:
-        """D, shape (n, n): holds declared disturbances, truncated process noise, remainder, rounding of a simulation.
+        """D: holds declared disturbances, truncated process noise, remainder and rounding of a simulation.
 
-        It is larger than `allowed_disturbance` by what holds that plus E(F), F = n diag(r^2), with r the rounding of
-        A x + B u + d for x up to SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
+        It holds `allowed_disturbance` plus E(F), F = n diag(r^2), with r the rounding of A x + B u + d for x up to
+        SIMULATED_REACH half-widths out: (1+s/4) allowed + (1+4/s) F, s the inflation.
         """
         return Ellipsoid(inflated(self.nominal_disturbance.shape_matrix) + self._rounding_margin)
 
     @cached_property
     def allowed_disturbance(self) -> Ellipsoid:
-        """What a disturbance may use of D: the rest is for the rounding of a simulation, shape (n, n)."""
+        """What a disturbance may use of D: the rest is for the rounding of a simulation."""
         nominal = self.nominal_disturbance.shape_matrix
         return Ellipsoid(0.5 * (nominal + inflated(nominal)) + 0.5 * self._rounding_margin)
 
     @cached_property
     def _rounding_margin(self) -> np.ndarray:
-        """What D gains for rounding, shape (n, n)."""
         reach = SIMULATED_REACH * self.half_widths
         rounding = exact.product(np.abs(self.A), reach) + exact.product(np.abs(self.B), self.largest_input) + reach
         rounding *= (self.n + self.m + 2) * np.finfo(float).eps
@@ -177,21 +170,21 @@ class HardBounds(LimitValues):
 
     @cached_property
     def nominal_disturbance(self) -> Ellipsoid:
-        """D before inflation: where extremal disturbances are drawn, so that their rounding stays inside E(D)."""
+        """D before inflation: extremal disturbances drawn here stay inside E(D) when rounded."""
         return self.of_disturbance.around(self.relative_weight, self.remainder_bound)
 
     @cached_property
     def nominal_sensor_error(self) -> Ellipsoid:
-        """Holds the sensor noise v before inflation, shape (p, p): the truncated noise plus `sensor_bound`."""
+        """Holds the sensor noise v before inflation."""
         return self.of_sensor.around(np.eye(self.p))
 
     @cached_property
     def sensor_error(self) -> Ellipsoid:
-        """Holds the sensor noise v, shape (p, p), without the channel's quantizer (see `sensor_error_with`)."""
+        """Holds the sensor noise v, without the channel's quantizer (see `sensor_error_with`)."""
         return Ellipsoid(inflated(self.nominal_sensor_error.shape_matrix))
 
     def sensor_error_with(self, quantization_step: float) -> Ellipsoid:
-        """Returns N, shape (p, p): sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
+        """Returns N: sensor noise plus the ball of squared radius p q^2/4 around a quantizer's box."""
         ball = Ellipsoid(self.p * quantization_step**2 / 4.0 * np.eye(self.p))
         return Ellipsoid(inflated(ellipsoid_around_sum(np.eye(self.p), ball, self.nominal_sensor_error).shape_matrix))
 
@@ -202,14 +195,14 @@ class HardBounds(LimitValues):
 
     @cached_property
     def nominal_initial_error(self) -> Ellipsoid:
-        """Holds the error of the first estimate before inflation, shape (n, n): the ball of r0 plus `initial_bound`."""
+        """Holds the error of the first estimate before inflation: the ball of r0 plus `initial_bound`."""
         unknown = np.arange(self.n) < self.n - self.past
         ball = Ellipsoid(self.initial_radius_squared * np.diag(unknown.astype(float)))
         return ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
 
     @cached_property
     def initial_error(self) -> Ellipsoid:
-        """Holds the error of the first estimate, shape (n, n), with slack for rounding."""
+        """Holds the error of the first estimate, with slack for rounding."""
         return Ellipsoid(inflated(self.nominal_initial_error.shape_matrix) + self.estimate_rounding)
 
     @cached_property
@@ -220,10 +213,10 @@ class HardBounds(LimitValues):
 
     @cached_property
     def kalman_covariances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Covariances (Q, R, P0) from which a Kalman filter picks its gains, shapes (n, n), (p, p), (n, n).
+        """Covariances (Q, R, P0) from which a Kalman filter picks its gains.
 
-        Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; sensor
-        noise and first errors that are bounded count with the covariance of a uniform draw, P / (dim + 2).
+        Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; other
+        bounds count with the covariance of a uniform draw, P / (dim + 2).
         """
         Q, R = self.of_disturbance.covariance(1.0), self.of_sensor.covariance(self.p + 2)
         Q = Q if self.remainder_bound is None else Q + self.remainder_bound.shape_matrix
@@ -231,16 +224,14 @@ class HardBounds(LimitValues):
 
 
 def inflated(shape: np.ndarray) -> np.ndarray:
-    """Returns a slightly larger bound, also in directions in which it is flat: room for the rounding of its entries."""
+    """Returns a slightly larger bound, with room for the rounding of its entries, also where it is flat."""
     return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
 
 
 def weight_of(rows: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Returns positive definite W, shape (n, n), of rows c_j, (k, n): C'C, regularized.
+    """Returns positive definite W, shape (n, n): C'C of rows c_j, (k, n), regularized by the reach of states in no row.
 
-    Args:
-        rows: Of the box.
-        reach: `reach_from_rest` of the states, shape (n,): it counts for those in no row; 0 stands for 1.
+    That is `reach_from_rest`, shape (n,), in which 0 stands for 1.
     """
     gram = exact.product(rows.T, rows)
     squares, sizes = np.diag(gram), FREE_REACH * np.where(reach > 0.0, reach, 1.0)

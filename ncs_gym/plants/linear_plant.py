@@ -9,13 +9,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 from ncs_gym.bounds import DELTA, Bounds, Sum
 from ncs_gym.limits import Limits, LimitValues
-from ncs_gym.model import Model, as_point
+from ncs_gym.model import Model
 from ncs_gym.plants.between_samples import BetweenSamples
 from ncs_gym.plants.description import assumptions_of, described
 from ncs_gym.plants.hard_bounds import Source, weight_of
@@ -23,10 +23,7 @@ from ncs_gym.plants.past_inputs import with_past_inputs
 from ncs_gym.plants.resting_point import at_rest, with_residual
 from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, read_back
-from ncs_gym.validation import as_names, as_numbers, counted, read_only, reason_of, shown
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+from ncs_gym.validation import as_names, counted, read_only, reason_of, shown
 
 # An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
 FARTHEST = 1e30
@@ -43,18 +40,16 @@ _VALUES: dict[str, type] = {"model": Model, "limits": Limits, "bounds": Bounds}
 class LinearPlant(BetweenSamples):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
 
-    States and inputs are deviations from an operating point: that of the model, which the middle of a disturbance with
-    two different ends moves to where it rests. Where inputs take effect late, or the change of inputs is limited, past
-    inputs are the last states. Nothing is changed: `dataclasses.replace` makes another plant, checked anew.
+    States and inputs are deviations from an operating point: that of the model, which the middle of a disturbance moves
+    to where it rests. Past inputs are the last states if inputs take effect late or their change is limited. What
+    follows is listed by `LimitValues`, `HardBounds` and `BetweenSamples`. `dataclasses.replace` makes another plant.
 
     Attributes:
         model: The equations.
         limits: Of states and inputs, in the model's units.
-        bounds: Of disturbances, sensor noise and the error of the first estimate, each a sum of sets.
+        bounds: Each a sum of sets.
         labels: Names of states and inputs with their units, {"states": {"angle": "rad"}, "inputs": {"voltage": "V"}}.
         region: Digest of the model and the limits, which a remainder belongs to.
-
-    What follows from these is listed by `LimitValues`, `HardBounds` and `BetweenSamples`.
 
     Raises:
         ValueError: If the values do not fit each other.
@@ -87,7 +82,6 @@ class LinearPlant(BetweenSamples):
             self._set(remainder=owned[0], bounds=replace(self.bounds, disturbance=disturbance))
 
     def _declare(self, sums: list[Sum], rest: LimitValues) -> None:
-        """Keeps what is declared of the three uncertainties."""
         n, rows = len(rest.A), rest.box
         weight, past = weight_of(rows, np.zeros(n)), self.past
         disturbance = Source.of(sums[0], weight, past, keeps_ball=True)
@@ -100,7 +94,6 @@ class LinearPlant(BetweenSamples):
         self._set(delta=next((each.gaussian.delta for each in sums if each.gaussian), DELTA))
 
     def _name(self) -> None:
-        """Keeps names and units of states and inputs."""
         labels = {} if self.labels is None else self.labels
         fits = isinstance(labels, Mapping) and {*labels} <= {"states", "inputs"}
         if not fits or not all(isinstance(each, Mapping) for each in labels.values()):
@@ -114,15 +107,12 @@ class LinearPlant(BetweenSamples):
             self._set(**{f"{name}_names": names, f"{name}_units": units})
         ages = [counted(age, "step") for age in range(self.past // self.m, 0, -1)]
         past = tuple(f"{name} of {age} ago" for age in ages for name in self.input_names)
-        self._set(
-            labels={name: dict(labels[name]) for name in labels} or None,
-            state_names=self.state_names + past,
-            state_units=self.state_units + self.input_units * len(ages),
-        )
+        self._set(state_names=self.state_names + past, state_units=self.state_units + self.input_units * len(ages))
+        self._set(labels={name: dict(labels[name]) for name in labels} or None)
 
     @property
     def document(self) -> dict[str, Any]:
-        """What a file of the plant holds, as JSON values: all that it was made with, every number exact."""
+        """What it was made with, as JSON values, every number exact."""
         document: dict[str, Any] = {"format": _FORMAT}
         for name in _VALUES:
             value = getattr(self, name)
@@ -131,19 +121,17 @@ class LinearPlant(BetweenSamples):
 
     @classmethod
     def load(cls, given: Mapping[str, Any] | str | os.PathLike[str]) -> Self:
-        """Returns the plant in a file of `save`, or of a `document`, checked like any other.
+        """Returns the plant in a file of `save`, or of a `document`.
 
         Raises:
             ValueError: If the file is missing or not that of a plant, or a value is wrong.
         """
-        document, name = given, "the document"
-        if not isinstance(given, Mapping):
-            name = shown(given)
-            try:
-                document = json_values(read_text(given))
-            except (OSError, TypeError, ValueError, RecursionError) as error:
-                reason = getattr(error, "strerror", None) or "it is not valid JSON"
-                raise ValueError(f"cannot read the plant in {name}: {reason}") from error
+        name = "the document" if isinstance(given, Mapping) else shown(given)
+        try:
+            document = given if isinstance(given, Mapping) else json_values(read_text(given))
+        except (OSError, TypeError, ValueError, RecursionError) as error:
+            reason = getattr(error, "strerror", None) or "it is not valid JSON"
+            raise ValueError(f"cannot read the plant in {name}: {reason}") from error
         if not isinstance(document, Mapping) or document.get("format") != _FORMAT:
             raise ValueError(f"{name} is not a plant of format {_FORMAT!r}")
         try:
@@ -153,29 +141,22 @@ class LinearPlant(BetweenSamples):
             raise ValueError(f"{name} is not that of a plant: {reason_of(error)}") from error
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes a JSON file in which every number is exact.
-
-        Raises:
-            OSError: If the file cannot be written.
-        """
+        """Writes a JSON file in which every number is exact."""
         Path(path).write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
 
     def __str__(self) -> str:
         return described(self)
 
+    assumptions = property(assumptions_of)
+
     def __repr__(self) -> str:
-        """Short, in place of all numbers: it is a part of the messages and settings of others."""
+        """Short, since messages and settings of others contain it."""
         counts = ((self.n, "state"), (self.m, "input"), (self.p, "output"))
         return f"<LinearPlant: {', '.join(counted(*each) for each in counts)}, fingerprint {self.fingerprint[:16]}>"
 
-    @property
-    def assumptions(self) -> tuple[str, ...]:
-        """What a certificate takes for granted beyond the numbers of the bounds, in sentences."""
-        return assumptions_of(self)
-
     @cached_property
     def without_remainder(self) -> LinearPlant:
-        """The same plant without its remainder: what is declared beside it."""
+        """The same plant without its remainder."""
         if self.remainder is None:
             return self
         return replace(self, bounds=replace(self.bounds, disturbance=self.bounds.disturbance.declared))
@@ -192,10 +173,7 @@ class LinearPlant(BetweenSamples):
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 over every number that proofs and simulations take of the plant, to bind certificates to it.
-
-        It is the same on every machine: these numbers are given, or rounded once (`ncs_gym.exact`).
-        """
+        """SHA-256 over every number that proofs and simulations take of the plant, the same on every machine."""
         return self.digest()
 
     def digest(self) -> str:
@@ -210,34 +188,6 @@ class LinearPlant(BetweenSamples):
         if self.between_samples is not None:
             numbers += [("between samples", self.between_samples), ("continuous", self.continuous_model)]
         return _digest(numbers)
-
-    def to_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
-        """Returns a physical state, input or output as its deviation from the operating point.
-
-        Args:
-            value: Shape (n,), (m,) or (p,), or of many environments (N, n), (N, m) or (N, p).
-            of: "state", "input" or "output"; the output at the operating point is H x0.
-
-        Raises:
-            ValueError: If `of` is none of these, or the values are no finite vectors of its size.
-        """
-        vectors, center = self._beside_point(value, of)
-        return vectors - center
-
-    def from_deviation(self, value: ArrayLike, of: str = "state") -> np.ndarray:
-        """Returns the physical state, input or output of a deviation; the inverse of `to_deviation`."""
-        vectors, center = self._beside_point(value, of)
-        return vectors + center
-
-    def _beside_point(self, value: ArrayLike, of: str) -> tuple[np.ndarray, np.ndarray]:
-        """Returns vectors, checked, and the operating value of what they are."""
-        points = {"state": self.operating_state, "input": self.operating_input, "output": self.H @ self.operating_state}
-        if not isinstance(of, str) or of not in points:
-            raise ValueError(f"of must be one of {list(points)}, got {shown(of)}")
-        center, numbers = points[of], as_numbers(value)
-        if numbers is None or numbers.ndim != 2:
-            return as_point(value, len(center), f"the {of}"), center
-        return np.array([as_point(each, len(center), f"the {of}") for each in numbers]).reshape(-1, len(center)), center
 
 
 def _digest(numbers: Iterable[tuple[Any, Any]]) -> str:

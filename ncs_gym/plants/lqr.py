@@ -28,17 +28,8 @@ def lqr_gain(
 
 
 def regulator_gain(A: np.ndarray, B: np.ndarray, effort: float, decay: float) -> np.ndarray | None:
-    """Returns K, shape (m, n), of u = K x that minimizes the sum of (|x|^2 + effort |u|^2) / decay^k.
+    """Returns K, shape (m, n), of u = K x that minimizes the sum of (|x|^2 + effort |u|^2) / decay^k; None as above.
 
-    The closed loop's eigenvalues are smaller than sqrt(decay).
-
-    Args:
-        A: Shape (n, n), in coordinates where |x| is the size of the state.
-        B: Shape (n, m), in coordinates where |u| is the size of the input.
-        effort: Weight of the inputs.
-        decay: In (0, 1].
-
-    Returns:
-        The gain; None where the Riccati equation has no solution that scipy finds.
+    The closed loop's eigenvalues are smaller than sqrt(decay), in (0, 1].
     """
     return lqr_gain(A / np.sqrt(decay), B / np.sqrt(decay), np.eye(len(A)), effort * np.eye(B.shape[1]))

@@ -6,35 +6,32 @@ import numpy as np
 
 from ncs_gym.limits import LimitValues, Rows
 
-# Rows of the box keep inputs under way within this many times their limits. They never leave those, so the rows only
-# bound the safe set: closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
+# Rows of the box keep inputs under way within this many times their limits, which they never leave: the rows only bound
+# the safe set. Closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
 STORED_INPUT_REACH = 4.0
 
 
 def acting(delays: np.ndarray, past: int) -> np.ndarray:
-    """Returns where among past and then present inputs those are that act now, shape (m,), by delays of shape (n, m).
+    """Returns which of past and then present inputs act now, shape (m,), by delays of shape (n, m).
 
     Raises:
         ValueError: If an input acts on several states with several delays.
     """
     if np.ptp(delays, axis=0).any():
-        raise ValueError(
-            "another process, or a limit of states and inputs together, needs one delay per input, as in "
-            "Model.with_delays([2, 0]), not one per state and input"
-        )
+        raise ValueError("another process, or a limit of states and inputs together, needs one delay per input")
     return past - delays.shape[1] * delays[0] + np.arange(delays.shape[1])
 
 
 def with_past_inputs(own: LimitValues, delays: np.ndarray, change: np.ndarray | None) -> LimitValues:
-    """Returns the plant with the inputs that it has to remember as further states: x, u_{k-d}, .., u_{k-1}.
+    """Returns the plant of the states x, u_{k-d}, .., u_{k-1}, with as many past inputs as it has to remember.
 
     Args:
-        own: The plant of its own states.
-        delays: Steps after which each input acts on each state, shape (n, m); d is the largest.
+        own: The plant of x.
+        delays: As of its model, shape (n, m); d is the largest.
         change: Largest change of each input from one step to the next, shape (m,); None for any.
 
     Raises:
-        ValueError: If limits of states and inputs together do not say which of several past inputs they mean.
+        ValueError: If a limit of states and inputs together does not say which past input it means.
     """
     (n, m), half, d = own.B.shape, own.input_half, int(delays.max())
     stored = m * (d or int(change is not None))

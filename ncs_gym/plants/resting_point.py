@@ -24,14 +24,9 @@ class MovedOperatingPointWarning(UserWarning):
 
 
 def at_rest(own: LimitValues, disturbance: Any) -> LimitValues:
-    """Returns a plant counted from where it rests: the point of its model, moved by the middle of a disturbance.
+    """Returns a plant counted from where it rests under E w, the middle of a disturbance: x = A x + B u + E w.
 
-    Where that middle, E w, is not zero, this is an (x, u) with x = A x + B u + E w, of such points that nearest to the
-    model's in units of the limits.
-
-    Args:
-        own: The plant, counted from the point of its model.
-        disturbance: A set in the dimension of the state.
+    That is the point of its model if E w = 0, else the nearest such point in units of the limits.
 
     Raises:
         ValueError: If no such point lies within the limits.
@@ -43,26 +38,17 @@ def at_rest(own: LimitValues, disturbance: Any) -> LimitValues:
     rest = own.around(x, u)
     points = rest.operating_state, rest.operating_input
     state, applied = ([float(f"{each:.6g}") for each in point] for point in points)
-    if not rest.is_within:
-        raise ValueError(
-            f"the middle of this disturbance moves the operating point to {shown(state)} with input {shown(applied)}, "
-            "which is not strictly within the limits"
-        )
-    warn_caller(
-        f"deviations are counted from the state {shown(state)} and the input {shown(applied)}, where the middle of "
-        "the disturbance rests (plant.operating_state)",
-        MovedOperatingPointWarning,
-    )
+    low, high = np.concatenate([rest.box_ends, rest.input_ends, rest.mixed_ends], axis=1)
+    if not ((low < 0.0) & (high > 0.0)).all():
+        raise ValueError(f"a disturbance rests at {shown(state)}, {shown(applied)}, not strictly within the limits")
+    text = f"deviations are counted from where the middle of the disturbance rests: {shown(state)}, {shown(applied)}"
+    warn_caller(text, MovedOperatingPointWarning)
     step_offset = own.step_offset + exact.product(np.abs(E), np.abs(middle))
     return rest.replaced(step_offset=step_offset, lacking=np.abs(missing) + own.lacking)
 
 
 def _resting(own: LimitValues, E: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns x, u, in deviations from the model's point, and A x + B u + E w - x there, which is rounding.
-
-    Raises:
-        ValueError: If no state stays where it is under the middle of the disturbance.
-    """
+    """Returns x, u, in deviations from the model's point, and A x + B u + E w - x there, which is rounding."""
     from scipy.linalg import null_space  # takes long to import
 
     (n, m), A, B, rows = own.B.shape, own.A, own.B, own.box
@@ -75,19 +61,16 @@ def _resting(own: LimitValues, E: np.ndarray, middle: np.ndarray) -> tuple[np.nd
     found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
     x, u = widths * found[:n], reach * found[n:]
     if not residual(A, B, E, x, u, middle)[1]:
-        raise ValueError(
-            f"no state stays where it is under the middle of this disturbance, {shown((E @ middle).tolist())} per "
-            "step, whatever the input: give symmetric ends around zero"
-        )
+        pushed = shown((E @ middle).tolist())
+        raise ValueError(f"no state stays where it is under the middle of a disturbance, {pushed} per step")
     x, u = _in_steps(x, np.abs(rows).max(axis=0)), _in_steps(u, 1.0 / reach)
     return x, u, residual(A, B, E, x, u, middle)[0]
 
 
 def _in_steps(values: np.ndarray, per_limit: np.ndarray) -> np.ndarray:
-    """Returns values, shape (k,), rounded to about `POINT_PRECISION` of limits; `per_limit`, (k,), is 1 over these.
+    """Returns values rounded to `POINT_PRECISION` of limits, of which `per_limit` is the inverse, by powers of two.
 
-    What LAPACK finds differs between processors in the last bits, and a point is part of what identifies a plant. Steps
-    are powers of two, so that rounding itself is exact.
+    What LAPACK finds differs between processors in the last bits, and a point is part of what identifies a plant.
     """
     sizes = np.where(per_limit > 0.0, 1.0 / np.where(per_limit > 0.0, per_limit, 1.0), np.maximum(np.abs(values), 1e-9))
     steps = np.exp2(np.round(np.log2(POINT_PRECISION * sizes)))
@@ -95,7 +78,7 @@ def _in_steps(values: np.ndarray, per_limit: np.ndarray) -> np.ndarray:
 
 
 def with_residual(bound: Ellipsoid, missing: np.ndarray, rows: np.ndarray) -> Ellipsoid:
-    """Returns a bound of d with what a point lacks of an equilibrium, doubled; rows, (k, n), give the units."""
+    """Returns a bound of d with twice what a point lacks of an equilibrium; rows, (k, n), give the units."""
     n = len(missing)
     gram = exact.product(rows.T, rows)
     lacking = np.diag(n * np.square(2.0 * np.abs(missing)))

@@ -26,11 +26,11 @@ SAMPLES = 8_000
 
 @dataclass(frozen=True, kw_only=True)
 class CartPoleProcess(Process):
-    """The equations of motion of a cart with a pole, a point mass on a light rod, without friction.
+    """A cart with a pole, a point mass on a light rod, without friction.
 
     With position p, angle a from upright and force u, M the cart's mass, m the pole's and l its length:
     p'' = (u + m sin(a) (l a'^2 - g cos(a))) / (M + m sin(a)^2) and a'' = (g sin(a) - cos(a) p'') / l; integrated by the
-    classical Runge-Kutta method. x = (p, p', a, a') as in `ncs_gym.cart_pole`.
+    classical Runge-Kutta method. x = (p, p', a, a').
 
     Attributes:
         cart_mass: M [kg].
@@ -51,21 +51,13 @@ class CartPoleProcess(Process):
             object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
-        """Returns the process itself.
-
-        Raises:
-            ValueError: If the plant does not have the cart-pole's four states and one input.
-        """
+        """Returns the process itself; raises ValueError unless the plant has four states and one input."""
         if (plant.n, plant.m) != (4, 1):
             raise ValueError(f"the cart-pole has 4 states and 1 input, the plant {plant.n} and {plant.m}")
         return self
 
     def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns the state a step of the plant later, shape (4,) or (4, N).
-
-        Raises:
-            ValueError: If it is not finite.
-        """
+        """Returns the state a step of the plant later, shape (4,) or (4, N); raises ValueError if it is not finite."""
         h = plant.dt / SUBSTEPS
         for _ in range(SUBSTEPS):
             first = self._rate(state, u)
@@ -87,10 +79,9 @@ class CartPoleProcess(Process):
 
 @lru_cache(maxsize=1)
 def nonlinear_cart_pole() -> LinearPlant:
-    """Returns the linear model of `CartPoleProcess()` over the box and the limits of `ncs_gym.cart_pole`.
+    """Returns the linear model of `CartPoleProcess()` within the limits of `ncs_gym.cart_pole`, of assumed remainder.
 
-    Its remainder is bounded by sampling: an assumption. The numbers are those that `sampled_cart_pole` found once, so
-    that they are the same on every machine.
+    The numbers are those that `sampled_cart_pole` found once, so that they are the same on every machine.
     """
     return LinearPlant.load(Path(__file__).with_name("cart_pole_nonlinear.json"))
 

@@ -58,31 +58,17 @@ class GymProcess(Process):
                 raise ValueError(f"GymProcess: {name} must be a function, got {shown(value)}")
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
-        """Returns the opened environments.
-
-        Raises:
-            ValueError: If they do not fit the plant, or `make` returns the same one again.
-        """
+        """Returns the opened environments; raises ValueError if they do not fit, or `make` returns one again."""
         if size is None:
             return OpenedEnv(self, plant)
         inner = [OpenedEnv(self, plant) for _ in range(size)]
         if len({id(each.env.unwrapped) for each in inner}) < size:
-            raise ValueError(
-                "GymProcess: make must return a fresh environment at every call, not one that it returned before"
-            )
+            raise ValueError("GymProcess: make must return a fresh environment at every call")
         return _OpenedEnvs(inner)
 
 
 class OpenedEnv(Process):
-    """One inner environment at run time.
-
-    Args:
-        process: How to make, read and write it.
-        plant: Gives the sizes and limits.
-
-    Raises:
-        ValueError: If `make` returns no environment, or its action space does not fit.
-    """
+    """One inner environment at run time; raises ValueError if it is none, or its action space does not fit."""
 
     def __init__(self, process: GymProcess, plant: LinearPlant) -> None:
         self._read, self._write, self._write_action = process.read_state, process.write_state, process.write_action
@@ -102,10 +88,7 @@ class OpenedEnv(Process):
     def _action_form(self, space: Any, plant: LinearPlant) -> tuple[Any, tuple[int, ...]]:
         """Returns dtype and shape of actions."""
         if not isinstance(space, Box):
-            raise ValueError(
-                f"GymProcess needs an environment with a Box of actions, got {type(space).__name__}: wrap it in a "
-                "gymnasium.ActionWrapper that takes a Box"
-            )
+            raise ValueError(f"GymProcess needs an environment with a Box of actions, got {type(space).__name__}")
         if self._write_action is None:
             if space.shape is None or int(np.prod(space.shape)) != plant.m:
                 raise ValueError(
@@ -114,11 +97,8 @@ class OpenedEnv(Process):
             low, high = space.low.ravel(), space.high.ravel()
             room = READ_BACK * np.maximum(np.abs(low), np.abs(high))
             if ((plant.input_ends - [low, high]) * [[-1.0], [1.0]] > room).any():
-                least, most = plant.input_ends.tolist()
-                raise ValueError(
-                    f"the input limits, {shown(least)} to {shown(most)}, go beyond the actions, {shown(low.tolist())} "
-                    f"to {shown(high.tolist())}: choose closer ones, or give GymProcess write_action"
-                )
+                ends, actions = shown(plant.input_ends.tolist()), shown([low.tolist(), high.tolist()])
+                raise ValueError(f"the input limits, {ends}, go beyond the actions, {actions}: give write_action")
         return space.dtype, space.shape
 
     def start(self, rng: np.random.Generator, state: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:  # noqa: D102
@@ -144,34 +124,26 @@ class OpenedEnv(Process):
         self._write(self.env, state.copy())
         read = self._read_state()
         if not (np.abs(read - state) <= READ_BACK * np.maximum(self._half_widths, np.abs(state))).all():
-            raise ValueError(
-                f"read_state gives {shown(read.tolist())} where write_state wrote {shown(state.tolist())}: they must "
-                "agree"
-            )
+            found, written = shown(read.tolist()), shown(state.tolist())
+            raise ValueError(f"read_state gives {found} where write_state wrote {written}: they must agree")
         return read
 
     def close(self) -> None:  # noqa: D102
         self.env.close()
 
     def _read_state(self) -> np.ndarray:
+        form = f"read_state must return the state, finite with shape ({self._n},)"
         try:
             value = self._read(self.env)
         except Exception as error:
-            raise ValueError(
-                f"read_state must return the state, shape ({self._n},), of what make returned: it raised "
-                f"{type(error).__name__} ({error})"
-            ) from error
+            raise ValueError(f"{form}: it raised {type(error).__name__} ({error})") from error
         state = as_setting(value)
         if state is None or state.shape != (self._n,) or not np.isfinite(state).all():
-            raise ValueError(
-                f"read_state must return the {self._n} finite numbers of the state, shape ({self._n},), got "
-                f"{shown(value)}"
-            )
-        return np.array(state)
+            raise ValueError(f"{form}, got {shown(value)}")
+        return state
 
 
 def _without_time_limits(env: gym.Env) -> gym.Env:
-    """Returns an environment without its time limits: the control loop has one of its own."""
     if isinstance(env, TimeLimit):
         return _without_time_limits(env.env)
     if isinstance(env, gym.Wrapper):
@@ -180,19 +152,14 @@ def _without_time_limits(env: gym.Env) -> gym.Env:
 
 
 class _OpenedEnvs(Process):
-    """Inner environments of a vector, stepped one after the other.
-
-    Args:
-        inner: One for each environment.
-    """
+    """Inner environments of a vector, stepped one after the other."""
 
     vectorized = True
 
     def __init__(self, inner: list[OpenedEnv]) -> None:
         self.inner = inner
         self.is_written = inner[0].is_written
-        self.terminated = np.zeros(len(inner), np.bool_)
-        self.truncated = np.zeros(len(inner), np.bool_)
+        self.terminated, self.truncated = np.zeros((2, len(inner)), np.bool_)
 
     def start(self, rng: np.random.Generator, state: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
         numbers = np.arange(len(self.inner)) if chosen is None else chosen

@@ -17,15 +17,7 @@ from ncs_gym.processes.process import FunctionProcess, LinearProcess, Process
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.uncertainty.shape_matrices import rounded_up
-from ncs_gym.validation import (
-    as_count,
-    as_matrix,
-    as_number,
-    as_setting,
-    counted,
-    shown,
-    warn_caller,
-)
+from ncs_gym.validation import as_count, as_matrix, as_number, as_setting, counted, shown, warn_caller
 
 # Fresh samples that check a bound, as a fraction of those that it was found with.
 HELD_OUT = 0.25
@@ -48,35 +40,26 @@ NO_EQUILIBRIUM = 1e-6
 DIGITS = 9
 
 
-# Where nothing is uncertain.
 _NOTHING = Bounds(disturbance=0.0, sensor=0.0, first_error=0.0)
 
 
 class _Region(NamedTuple):
-    """Where the remainder is bounded, as far as other limits allow: low <= (x, u) <= high in deviations, (n + m,)."""
+    """Where the remainder is bounded: low <= (x, u) <= high in deviations, shape (n + m,)."""
 
     low: np.ndarray
     high: np.ndarray
 
     @property
     def half(self) -> np.ndarray:
-        """Half the range, shape (n + m,)."""
         return 0.5 * (self.high - self.low)
 
     @classmethod
     def of(cls, frame: LinearPlant) -> _Region:
-        """Returns the smallest one that holds the box and the input limits of a plant.
-
-        Raises:
-            ValueError: If a state lacks an end.
-        """
+        """Returns the one of a plant's limits; raises ValueError if a state lacks an end."""
         low, high = np.concatenate([frame.own_limits, frame.input_ends], axis=1)
         if not np.isfinite(low + high).all():
             first = int(np.argmin(np.isfinite(low + high))) + 1
-            raise ValueError(
-                f"the remainder is bounded over limits of every state, and state {first} has no two finite ones: give "
-                "it generous limits"
-            )
+            raise ValueError(f"the remainder needs two finite limits of every state, if generous ones: state {first}")
         return cls(low, high)
 
 
@@ -105,19 +88,18 @@ def linear_model(
 ) -> LinearPlant:
     """Returns x+ = A x + B u + r + d as a plant, r in a bound on what A x + B u leaves out within the limits.
 
-    `plant.remainder` says how the bound is known. By sampling, A and B make the largest remainder of the samples small,
-    and the smallest ellipsoid around these remainders, `safety_factor` times as large, is an *assumption*. From bounds
-    on the Jacobian it is *proved* by the mean value theorem: A and B are the middle of the interval, and
-    |r_i| <= |f_i(0, 0)| + sum_j (half-width of J_ij) (largest |z_j|), z = (x, u). Fresh samples confirm either.
+    By sampling, A and B make the largest remainder of the samples small, and the smallest ellipsoid around these
+    remainders, `safety_factor` times as large, is an *assumption*. From bounds on the Jacobian it is *proved* by the
+    mean value theorem: A and B are the middle of the interval, and |r_i| <= |f_i(0, 0)| + sum_j (half-width of J_ij)
+    (largest |z_j|), z = (x, u). Fresh samples confirm either. `plant.remainder` says how the bound is known.
 
     Args:
         process: What really moves, or a step function (x, u) -> x+; in deviations from the operating point, near which
             f(0, 0) = 0.
-        limits: Of which every state needs two finite ends.
+        limits: With two finite ends of every state.
         bounds: Of what is uncertain beside the remainder.
         dt: Duration of a step [s].
-        at: State and input that deviations are counted from, as of a `Model`; they also say how many of each there are,
-            which otherwise the limits do.
+        at: As of a `Model`; it also says how many states and inputs there are, which otherwise the limits do.
         H: Output matrix, shape (p, n); the identity by default.
         labels: As of a `LinearPlant`.
         matrices: A and B, in place of fitted ones.
@@ -130,9 +112,9 @@ def linear_model(
         NoEquilibriumWarning: If a step from (0, 0) leads elsewhere, with how far.
 
     Raises:
-        ValueError: If the remainder is larger than the box can bear, fresh samples contradict the bound, a state lacks
-            a limit, a disturbance moves the operating point, the process cannot be put into a state, is no function of
-            it although a proof is asked for, or an argument is wrong.
+        ValueError: If the remainder is too large for the box, fresh samples contradict the bound, a state lacks a
+            limit, a disturbance moves the operating point, the process cannot be put into a state, or is no function of
+            it where a proof is asked for, or an argument is wrong.
     """
     if isinstance(process, LinearProcess):
         raise ValueError("the linear process is its own model: give what really moves")
@@ -152,10 +134,8 @@ def linear_model(
     widths = region.half[: frame.n]
     if jacobian_bounds is not None:
         if spread > ROUNDING:
-            raise ValueError(
-                f"steps from the same state with the same input differ by {spread:.3g} half-widths of the box: noise, "
-                "or memory beyond the state, of which bounds on a Jacobian prove nothing"
-            )
+            differ = f"steps from the same state with the same input differ by {spread:.3g} half-widths"
+            raise ValueError(f"{differ}: bounds on a Jacobian prove nothing of noise, or of memory beyond the state")
         A, B, bound = _from_jacobians(jacobian_bounds, region, origin)
         basis = "from bounds on its Jacobian"
     else:
@@ -167,17 +147,12 @@ def linear_model(
     largest, count = _confirmed(bound, _left_out(A, B, fresh), widths), fresh.states.shape[1]
     basis = f"{basis}, with at most {largest:.0%} of the bound in {count:,} fresh samples"
     if (off := float((np.abs(origin) / widths).max())) > max(NO_EQUILIBRIUM, spread):
-        warn_caller(
-            f"the operating point is no equilibrium: a step from (0, 0) moves it by {off:.3g} half-widths of the box, "
-            "which the remainder has to hold",
-            NoEquilibriumWarning,
-        )
+        moves = f"a step from (0, 0) moves it by {off:.3g} half-widths, which the remainder has to hold"
+        warn_caller(f"the operating point is no equilibrium: {moves}", NoEquilibriumWarning)
     reached = np.sqrt(np.diag(bound.shape_matrix)) / widths
     if reached.max() >= 1.0:
-        raise ValueError(
-            f"the remainder of the linear model alone moves state {reached.argmax() + 1} by {reached.max():.3g} "
-            "half-widths of the box in one step: shrink the box, the input limits or dt"
-        )
+        moves = f"moves state {reached.argmax() + 1} by {reached.max():.3g} half-widths in one step"
+        raise ValueError(f"the remainder of the linear model alone {moves}: shrink the box, the input limits or dt")
     model = Model(A, B, H, dt, at)
     remainder = Remainder(bound, jacobian_bounds is not None, basis, None, LinearPlant(model, own, _NOTHING).region)
     return LinearPlant(model, limits, replace(bounds, disturbance=Sum((bounds.disturbance, remainder))), labels)
@@ -188,7 +163,7 @@ class NoEquilibriumWarning(UserWarning):
 
 
 def _size_of(limits: Any, point: Any) -> int:
-    """Returns how many entries limits and a point have, some of which may be numbers."""
+    """Returns how many entries limits and a point have."""
     numbers = as_setting(limits if point is None else point)
     if numbers is None:  # a number and a vector
         return max((np.size(end) for end in limits), default=1) if isinstance(limits, tuple) else 1
@@ -200,15 +175,7 @@ def _size_of(limits: Any, point: Any) -> int:
 def _steps_of(
     process: Process, frame: LinearPlant, region: _Region, count: int, rng: np.random.Generator
 ) -> tuple[_Steps, _Steps, np.ndarray, float]:
-    """Returns sampled steps, fewer fresh ones, f(0, 0), shape (n,), and by how many half-widths repeated steps differ.
-
-    Args:
-        process: What moves.
-        frame: Plant with the limits.
-        region: Where the remainder is bounded.
-        count: Number of steps.
-        rng: Source of randomness.
-    """
+    """Returns `count` sampled steps, fewer fresh ones, f(0, 0), and by how many half-widths repeated steps differ."""
     moving = process.opened(frame, None)
     try:
         if not moving.is_written:
@@ -224,21 +191,18 @@ def _steps_of(
 
 
 def _first_step(moving: Process, frame: LinearPlant) -> np.ndarray:
-    """Returns f(0, 0), shape (n,)."""
     n, m = frame.n, frame.m
     try:
         return moving.step(frame, moving.write(np.zeros(n)), np.zeros(m))
     except (IndexError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"the process cannot move a state of {n} {'entry' if n == 1 else 'entries'} with "
-            f"{counted(m, 'input')}, the sizes of limits and at: {error}"
-        ) from error
+        sizes = f"{counted(n, 'state')} and {counted(m, 'input')}, the sizes of limits and at"
+        raise ValueError(f"the process cannot move with {sizes}: {error}") from error
 
 
 def _sampled(moving: Process, frame: LinearPlant, region: _Region, count: int, rng: np.random.Generator) -> _Steps:
-    """Returns steps from random points of the region; half of them have coordinates on its boundary.
+    """Returns steps from random points of the region, half of them with coordinates on its boundary.
 
-    A point that limits of several coordinates forbid is pulled towards zero onto their boundary.
+    Points that limits of several coordinates forbid are pulled towards zero onto their boundary.
     """
     low, high = (side[:, None] for side in region)
     points = rng.uniform(-1.0, 1.0, (len(low), count))
@@ -257,7 +221,6 @@ def _sampled(moving: Process, frame: LinearPlant, region: _Region, count: int, r
 def _moved(
     moving: Process, frame: LinearPlant, states: np.ndarray, inputs: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Returns the next states, shape (n, N), after states (n, N) with inputs (m, N)."""
     if moving.vectorized:
         return moving.step(frame, states, inputs)
     x_next = np.empty_like(states)
@@ -275,7 +238,6 @@ def _left_out(A: np.ndarray, B: np.ndarray, steps: _Steps) -> np.ndarray:
 def _from_jacobians(
     bounds: tuple[Any, Any], region: _Region, origin: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Ellipsoid]:
-    """Returns A, B and the proved bound."""
     n, size = len(origin), len(region.low)
     if not isinstance(bounds, (tuple, list)) or len(bounds) != 2:
         raise ValueError(f"jacobian_bounds must be two arrays of shape ({n}, {size}), got {shown(bounds)}")
@@ -290,14 +252,12 @@ def _from_jacobians(
 
 
 def _confirmed(bound: Ellipsoid, remainders: np.ndarray, widths: np.ndarray) -> float:
-    """Returns the largest size of fresh remainders, shape (N, n), in units of their bound."""
+    """Returns the largest size of fresh remainders, shape (N, n), in units of their bound: at most 1."""
     padded = Ellipsoid(bound.shape_matrix + np.diag((ROUNDING * widths) ** 2))
     largest = float(padded.gauge(remainders).max())
     if largest > 1.0:
-        raise ValueError(
-            f"a fresh sample of the remainder is {largest:.3g} times as large as its bound: use more samples, a larger "
-            "safety_factor, or correct the jacobian_bounds"
-        )
+        advice = "use more samples, a larger safety_factor, or correct the jacobian_bounds"
+        raise ValueError(f"a fresh sample of the remainder is {largest:.3g} times as large as its bound: {advice}")
     return largest
 
 
@@ -306,13 +266,8 @@ def fitted_matrices(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns A and B for which the largest remainder of the samples, in half-widths of the box, is nearly smallest.
 
-    Lawson's algorithm: least squares again and again, each sample weighted with its remainders so far.
-
-    Args:
-        states: Shape (n, N).
-        inputs: Shape (m, N).
-        moved: Next states, shape (n, N).
-        widths: Half-widths of the box, shape (n,).
+    Lawson's algorithm: least squares again and again, each sample weighted with its remainders so far. The samples are
+    states (n, N), inputs (m, N) and next states (n, N).
     """
     regressors = np.concatenate([states, inputs]).T
     units = np.maximum(np.abs(regressors).max(axis=0), np.finfo(float).tiny)
@@ -334,13 +289,9 @@ def fitted_matrices(
 
 
 def surrounding_shape(points: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """Returns P, shape (n, n), of nearly the smallest ellipsoid E(P) around points and their negatives.
+    """Returns P of nearly the smallest ellipsoid E(P) around points, (N, n), in units of widths, and their negatives.
 
     Khachiyan's algorithm in the principal axes of the points; an axis without extent gets a little of it.
-
-    Args:
-        points: Shape (N, n).
-        widths: Half-widths of the box, shape (n,): the unit of each entry.
     """
     scaled = points / widths
     if not np.any(scaled):

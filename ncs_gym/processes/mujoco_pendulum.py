@@ -44,11 +44,7 @@ class InvertedPendulumProcess(Process):
         object.__setattr__(self, "mass_factor", as_number(self.mass_factor, "mass_factor", low=0.0, low_open=True))
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
-        """Returns the opened environments.
-
-        Raises:
-            ModuleNotFoundError: If MuJoCo is missing.
-        """
+        """Returns the opened environments; raises ModuleNotFoundError if MuJoCo is missing."""
         if find_spec("mujoco") is None:
             raise ModuleNotFoundError(f"InvertedPendulum-v5 needs MuJoCo: {install_command('mujoco')}")
         return GymProcess(self._make, read_state=_read, write_state=_write).opened(plant, size)
@@ -71,7 +67,7 @@ def _write(env: Any, state: np.ndarray) -> None:
 
 @lru_cache(maxsize=1)
 def inverted_pendulum() -> LinearPlant:
-    """Returns the linear model of `InvertedPendulum-v5` with a remainder bounded by sampling: an assumption.
+    """Returns the linear model of `InvertedPendulum-v5`, of assumed remainder.
 
     The numbers are those that `sampled_inverted_pendulum` found once, so that they are the same on every machine.
     """
@@ -79,11 +75,7 @@ def inverted_pendulum() -> LinearPlant:
 
 
 def sampled_inverted_pendulum() -> LinearPlant:
-    """Returns the same model, found anew.
-
-    Raises:
-        ModuleNotFoundError: If MuJoCo is missing.
-    """
+    """Returns the same model, found anew; raises ModuleNotFoundError if MuJoCo is missing."""
     noise = 5e-4 * np.array(BOX)
     labels = {
         "states": {"position": "m", "angle": "rad", "speed": "m/s", "angular rate": "rad/s"},

@@ -1,4 +1,4 @@
-"""The step of the plant: what really moves, with disturbances, noise and sensors, in one environment or in many."""
+"""The step of the plant: what really moves, with disturbances, noise and sensors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ncs_gym.bounds import Bounds
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.past_inputs import acting
 from ncs_gym.processes.process import FamilyProcess, LinearProcess, Process, own_process
-from ncs_gym.uncertainty.disturbances import ROUNDING, Disturbance, checked, stays_inside
+from ncs_gym.uncertainty.disturbances import BY_NAME, ROUNDING, Disturbance, checked
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import guarded, read_only
 
@@ -24,7 +24,7 @@ class BlockSampler:
     """Draws samples for many steps at once, and hands them out step by step.
 
     Args:
-        draw: Returns `count` samples of dimension n, shape (n, count), given a source of randomness and `count`.
+        draw: Returns `count` samples, shape (n, count), given a source of randomness and `count`.
         size: Number of environments, the last axis of what is handed out; None for one without that axis.
     """
 
@@ -34,7 +34,7 @@ class BlockSampler:
         self._left: list[np.ndarray] = []
 
     def next(self, rng: np.random.Generator) -> np.ndarray:
-        """Returns samples of one step, shape (n,) or (n, size)."""
+        """Returns samples of a step, shape (n,) or (n, size)."""
         if not self._left:
             samples = self._draw(rng, self._count * (self._size or 1))
             steps = samples.T if self._size is None else samples.reshape(len(samples), self._count, -1).swapaxes(0, 1)
@@ -42,28 +42,27 @@ class BlockSampler:
         return self._left.pop()
 
     def forget(self) -> None:
-        """Forgets what is left, so that the next samples depend on the source of randomness alone."""
+        """Forgets what is left."""
         self._left = []
 
 
 class PlantSimulation:
     """x+ = f(x, u) + d and y = H x + v, simulated; the last axis of every array is the environment.
 
-    Beside a process other than the plant's own equations, d is within what the plant declares beside its remainder, and
-    nothing if that is nothing, or if the process cannot be put into a state: what the plant declares is then its own.
+    Beside a process other than the plant's own equations, d is within what the plant declares beside its remainder, or
+    nothing if the process cannot be put into a state.
 
     Args:
         plant: The plant with its bounds, the certified model of what moves.
         disturbance: What acts on it; process noise is added unless it replaces that.
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising.
         size: Number of environments; None for one without that axis.
-        noise: How process noise, sensor noise and first errors are drawn, one of `NOISES`.
-        process: What moves; the plant's own equations, or those of its family's members, by default.
+        noise: One of `NOISES`.
+        process: What moves; that of `own_process` by default.
 
     Attributes:
         plant: The plant whose noise and disturbances are drawn: without the remainder beside another process.
-        alarm: Whether x+ - A x - B u lay outside E(D) in a step of this episode, so that no proof about the model is
-            one about the process; shape (N,) for many environments.
+        alarm: Whether x+ - A x - B u lay outside E(D) in a step of this episode; shape (N,) for many environments.
 
     Raises:
         ValueError: If the process does not fit the plant, or a disturbance of the user's cannot act on it.
@@ -93,7 +92,7 @@ class PlantSimulation:
         if size is not None and self._limit is not None:
             self._limit = self._limit[:, None]
         self._is_drawn_ahead = disturbance.memoryless and disturbance.vectorized
-        self._trusted = stays_inside(disturbance)
+        self._trusted = type(disturbance) in BY_NAME.values()  # those lie in E(D) by construction
         self._may_leave = allow_assumption_violation and not self._trusted
         if not self._trusted and not self.process.is_written:
             raise ValueError("a disturbance of your own can act only on a process with write_state: give it one")
@@ -105,16 +104,16 @@ class PlantSimulation:
 
     @property
     def infos(self) -> dict[str, np.ndarray]:
-        """What infos say of the process: parameters of the member of a family, a fresh array, (k,) or (N, k)."""
+        """What infos say of the process: the parameters of a family's member, a fresh array."""
         parameters = self.process.parameters
         return {} if parameters is None else {"parameters": parameters}
 
     def read_parameters(self, given: Any) -> np.ndarray | None:
-        """Returns what an option of `reset` fixes of the parameters of the member of a family."""
+        """Returns what `Process.read_parameters` does, anywhere if assumptions may be violated."""
         return self.process.read_parameters(given, anywhere=self._allow)
 
     def _draw_process_noise(self, rng: np.random.Generator, count: int) -> np.ndarray:
-        """Returns process noise, and the disturbance where it depends on nothing but chance, shape (n, count)."""
+        """Returns process noise, with the disturbance where that depends on chance alone, shape (n, count)."""
         plant, source = self.plant, self.disturbance
         noise = np.zeros((plant.n, count))
         if not source.replaces_process_noise:
@@ -128,13 +127,8 @@ class PlantSimulation:
     def _sum(self, d: Any, noise: np.ndarray | None, count: int | None) -> np.ndarray:
         """Returns disturbance plus process noise, shape (n,) or (n, count), inside E(D) unless noise has no bound.
 
-        What the disturbance may be is decided as if the noise were truncated: on its sum with the noise pulled back
-        onto the ellipsoid of the truncation; what was pulled back is added afterwards.
-
-        Args:
-            d: What the disturbance drew.
-            noise: Process noise, shape (n,) or (n, count); None if the disturbance replaces it.
-            count: Number of environments or of draws; None for arrays without that axis.
+        What the disturbance may be is decided with the noise pulled back onto the ellipsoid of its truncation; what was
+        pulled back is added afterwards. There is no noise where the disturbance replaces it.
         """
         if self._trusted:
             return d if noise is None else d + noise
@@ -160,24 +154,20 @@ class PlantSimulation:
         return self.plant.of_first_error.drawn(rng, count, truncated=self._truncated).T
 
     def forget(self) -> None:
-        """Forgets noise drawn ahead: after seeding, everything depends on the seed alone."""
+        """Forgets noise drawn ahead, so that everything depends on a new seed alone."""
         self.sensor_noise.forget()
         self.process_noise.forget()
 
     def start(
         self, rng: np.random.Generator, state: np.ndarray, initial: Ellipsoid | None, fixed: np.ndarray | None = None
     ) -> tuple[np.ndarray, Ellipsoid | np.ndarray]:
-        """Starts an episode; returns its first state, shape (n,), and what that is known to lie in.
+        """Starts an episode; returns its first state, shape (n,), and what that is known to lie in, the set or itself.
 
         Args:
             rng: Source of randomness.
             state: Where it is to start, shape (n,).
-            initial: The set that this was drawn from; None for a given state. A start elsewhere, where the process
-                itself went, is known as the state itself.
+            initial: The set that this was drawn from; None for a given state, which a process may refuse.
             fixed: What `read_parameters` returned; None to draw all parameters.
-
-        Raises:
-            ValueError: If the process cannot start at a given state.
         """
         self._require_written(initial)
         self.process.choose(rng, None, fixed)
@@ -200,9 +190,6 @@ class PlantSimulation:
         Returns:
             The first states, shape (n, k), and what is known of them, shape (k, n): a row of NaN for a state in the
             initial set, the state itself for another one.
-
-        Raises:
-            ValueError: If the process cannot start at given states.
         """
         self._require_written(initial)
         chosen = np.flatnonzero(mask)
@@ -219,20 +206,13 @@ class PlantSimulation:
             raise ValueError("this process cannot start at a given state: give its GymProcess write_state")
 
     def begin(self, rng: np.random.Generator, count: int | None = None) -> Any:
-        """Returns what the disturbance keeps for an episode, or for `count` of them along the last axis."""
+        """Returns what the disturbance keeps for an episode, or for `count` of them."""
         if count is None:
             return self.disturbance.begin(rng, self.plant)
         return self.disturbance.begin_many(rng, self.plant, count)
 
     def advance(self, rng: np.random.Generator, state: np.ndarray, u: np.ndarray, steps: Any, memory: Any) -> Any:
-        """Returns the next state, shape (n,) or (n, size).
-
-        Args:
-            rng: Source of randomness.
-            state: x, shape (n,) or (n, size).
-            u: Applied input, shape (m,) or (m, size).
-            steps: Steps taken in the episode before this one, an int or shape (size,).
-            memory: What `begin` returned.
+        """Returns the next state, shape (n,) or (n, size), given what `begin` returned and the steps of the episode.
 
         Raises:
             ValueError: If a disturbance lies outside its bound and that is not allowed, or the process cannot move.
@@ -256,12 +236,12 @@ class PlantSimulation:
         return self._watched(x_next, nominal)
 
     def _of_moved(self, change: Callable[[np.ndarray], np.ndarray], state: np.ndarray) -> np.ndarray:
-        """Returns a state of which a process changes all but the past inputs that are kept beside it."""
+        """Returns a state of which a process changes all but past inputs that are kept beside it."""
         n = self._moved.n
         return change(state) if len(state) == n else np.concatenate([change(state[:n]), state[n:]])
 
     def _watched(self, x_next: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Returns x+, and raises the alarm where x+ - A x - B u lies outside E(D)."""
+        """Returns x+, with the alarm where x+ - A x - B u lies outside E(D)."""
         gauge = self._model.disturbance.gauge((x_next - nominal).T)  # NaN where it overflows
         self.alarm = self.alarm | np.logical_not(gauge <= 1.0)
         return x_next

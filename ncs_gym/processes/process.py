@@ -15,18 +15,13 @@ from ncs_gym.validation import as_flag, as_setting, shown
 class Process:
     """What really moves; the plant is the certified model of it (docs/beyond_linear.md).
 
-    Where states of the plant are past inputs (delays, limits of rates), the environment keeps these: a process moves
-    the others, with the input that acts, and gets a plant of them alone.
-
-    A process is a setting: one object may serve any number of environments. What keeps something at run time returns
-    another process from `opened`, which belongs to a single environment, or to a vector of them.
+    Past inputs that are states of the plant are kept by the environment: a process moves the others, with the input
+    that acts, and gets a plant of them alone. One object may serve any number of environments; what keeps something at
+    run time returns another process from `opened`.
 
     Attributes:
-        vectorized: Whether `step` takes any number of states and inputs at once, as that of what `opened` returns for
-            many environments has to. It is never inherited: a subclass that does not declare it is stepped for one
-            environment after the other.
-        is_written: Whether it can be put into a state, so that episodes start where the environment says and
-            disturbances of the plant can act.
+        vectorized: Whether `step` takes any number of states and inputs at once; a subclass does not inherit it.
+        is_written: Whether it can be put into a state, to start episodes there and to let disturbances act.
         terminated, truncated: Whether it ended the episode by itself; arrays (N,) for many environments.
     """
 
@@ -36,7 +31,7 @@ class Process:
     truncated: Any = False
 
     def __init_subclass__(cls, **keywords: Any) -> None:
-        """Keeps a subclass from inheriting a promise about a method that it may override."""
+        """Takes a promise about a method from a subclass, which may override it."""
         super().__init_subclass__(**keywords)
         cls.vectorized = vars(cls).get("vectorized", False)
 
@@ -50,31 +45,17 @@ class Process:
 
     @property
     def parameters(self) -> np.ndarray | None:
-        """Those of the present episode, shape (k,), or of N, shape (N, k); None if no episode differs from others."""
+        """Those of the present episode, shape (k,), or of N, (N, k); None if episodes do not differ."""
         return None
 
     def read_parameters(self, given: Any, *, anywhere: bool = False) -> np.ndarray | None:
-        """Returns what an option of `reset` fixes of the parameters of episodes, NaN where it fixes nothing.
-
-        Args:
-            given: A dictionary; None for nothing.
-            anywhere: Whether parameters beyond the ranges of the proof are allowed.
-
-        Raises:
-            ValueError: If there are no such parameters.
-        """
+        """Returns what an option of `reset` fixes of the parameters of episodes (`Family.read`)."""
         if given is not None:
             raise ValueError("options['parameters'] is for the plant of a family (ncs_gym.family)")
         return None
 
     def choose(self, rng: np.random.Generator, chosen: np.ndarray | None, fixed: np.ndarray | None) -> None:
-        """Draws the parameters of episodes that begin; before `start`.
-
-        Args:
-            rng: Source of randomness.
-            chosen: Numbers of their environments, shape (k,); None without that axis.
-            fixed: What `read_parameters` returned; None for nothing.
-        """
+        """Draws the parameters of episodes that begin in the chosen environments, but for fixed ones."""
 
     def start(self, rng: np.random.Generator, state: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
         """Starts episodes, and returns the states that they start in.
@@ -82,20 +63,16 @@ class Process:
         Args:
             rng: Source of randomness.
             state: Where to start, shape (n,), or (n, k) for k chosen environments.
-            chosen: Numbers of these environments, shape (k,); None without that axis.
+            chosen: Numbers of these, shape (k,); None without that axis.
         """
         return state
 
     def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns the next state without disturbance, shape (n,) or (n, N), for inputs (m,) or (m, N).
-
-        Raises:
-            ValueError: If it is one of those that move only once they are `opened`.
-        """
+        """Returns the next state without disturbance, shape (n,) or (n, N), for inputs (m,) or (m, N)."""
         raise ValueError(f"a {type(self).__name__} moves only once it is opened")
 
     def step_many(self, plant: LinearPlant, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """Returns what `step` does for states (n, N) and inputs (m, N), for all at once or for one after the other."""
+        """Returns what `step` does for states (n, N) and inputs (m, N), at once or one by one."""
         if self.vectorized:
             return self.step(plant, states, inputs)
         each = [self.step(plant, x, u) for x, u in zip(states.T, inputs.T, strict=True)]
@@ -127,18 +104,14 @@ class FamilyProcess(Process):
     vectorized: ClassVar[bool] = True
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
-        """Returns what moves the members of the present episodes.
-
-        Raises:
-            ValueError: If the plant is that of no family.
-        """
+        """Returns what moves the members of the present episodes."""
         if plant.members is None:
             raise ValueError("FamilyProcess is for the plant of a family: make it by ncs_gym.family")
         return _Members(plant, plant.members, size)
 
 
 class _Members(Process):
-    """One member of a family, or one of each of `size` environments; the plant of the middle until they are chosen."""
+    """One member of a family, or one for each of `size` environments; the middle until they are chosen."""
 
     vectorized = True
 
@@ -174,16 +147,12 @@ class _Members(Process):
 
 
 def own_process(plant: LinearPlant) -> Process:
-    """Returns what moves where no process is given: the plant's own equations, or those of its family's members."""
+    """Returns what moves by default: the plant's own equations, or those of its family's members."""
     return LinearProcess() if plant.members is None else FamilyProcess()
 
 
 def as_process(value: Any) -> Process:
-    """Returns a process that somebody gave.
-
-    Raises:
-        ValueError: If it is none.
-    """
+    """Returns a process; raises ValueError if it is none."""
     if isinstance(value, Process):
         return value
     raise ValueError(f"process must be of type Process, such as FunctionProcess(f), got {type(value).__name__}")
@@ -191,10 +160,10 @@ def as_process(value: Any) -> Process:
 
 @dataclass(frozen=True)
 class FunctionProcess(Process):
-    """x+ = f(x, u) + d for a function f; the plant's declared disturbances without its remainder act on top.
+    """x+ = f(x, u) + d for a function f; d is what the plant declares beside its remainder.
 
     Attributes:
-        function: Returns x+ of shape (n,), given x of shape (n,) and u of shape (m,) [physical units].
+        function: Returns x+, shape (n,), given x, (n,), and u, (m,) [physical units].
         vectorized: Whether it also takes arrays (n, N) and (m, N) of many environments, and returns (n, N).
 
     Raises:
@@ -210,11 +179,7 @@ class FunctionProcess(Process):
         object.__setattr__(self, "vectorized", as_flag(self.vectorized, "vectorized"))
 
     def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns what the function returns.
-
-        Raises:
-            ValueError: If that is not finite, or of another shape than the state.
-        """
+        """Returns what the function returns; raises ValueError if that is no finite state."""
         value = self.function(state.copy(), u.copy())
         x_next = as_setting(value)
         if x_next is None or x_next.shape != state.shape or not np.isfinite(x_next).all():

@@ -17,18 +17,18 @@ from ncs_gym.validation import ReadOnlyArrays, guarded, shown
 class Task(ReadOnlyArrays, ABC):
     """A reward, and perfectly known extra entries of the observation.
 
-    `begin` draws the task's state for an episode, `advance` moves it one step; neither stores anything in the settings,
-    so that one object serves any number of environments; a vector environment refuses what does.
+    `begin` draws the task's state for an episode, `advance` moves it one step; neither stores anything in the object,
+    which any number of environments share.
 
     Attributes:
-        vectorized: Whether the methods also take arrays whose last axis is the environment, `begin` with a `size`. It
-            is never inherited: a subclass that does not declare it is called for one environment at a time.
+        vectorized: Whether the methods also take arrays whose last axis is the environment, `begin` with a `size`; a
+            subclass does not inherit it.
     """
 
     vectorized: ClassVar[bool] = False
 
     def __init_subclass__(cls, **keywords: Any) -> None:
-        """Keeps a subclass from inheriting a promise about methods that it may override."""
+        """Takes a promise about methods from a subclass, which may override these."""
         super().__init_subclass__(**keywords)
         cls.vectorized = vars(cls).get("vectorized", False)
 
@@ -43,8 +43,7 @@ class Task(ReadOnlyArrays, ABC):
     def predict(self, plant: LinearPlant, task_state: Any, u: np.ndarray) -> Any:
         """Returns what is known of the task's state after an input that is already decided, (m,) or (m, N), is applied.
 
-        Behind a downlink observations belong to the time at which the next input takes effect. What chance does by then
-        is not known: unchanged by default.
+        Behind a downlink observations belong to the time at which the next input takes effect. Unchanged by default.
         """
         return task_state
 
@@ -53,10 +52,7 @@ class Task(ReadOnlyArrays, ABC):
         return np.zeros((0, *np.shape(task_state)[1:]))
 
     def observation_bound(self, plant: LinearPlant, horizon: int) -> np.ndarray:
-        """Returns the largest absolute value of each extra entry within `horizon` steps, shape (extra,).
-
-        A task with `observe` has to have it. What is beyond is clipped, with a warning.
-        """
+        """Returns the largest size of each extra entry within `horizon` steps, shape (extra,), where it is clipped."""
         return np.zeros(0)
 
     @abstractmethod
@@ -77,7 +73,7 @@ class Task(ReadOnlyArrays, ABC):
     def advance_many(
         self, rng: np.random.Generator, plant: LinearPlant, task_state: np.ndarray, u: np.ndarray
     ) -> np.ndarray:
-        """Returns what `advance` does for inputs (m, N) of N environments."""
+        """Returns `advance` for inputs (m, N) of N environments."""
         if self.vectorized:
             return self.advance(rng, plant, task_state, u)
         moved = np.empty_like(task_state)
@@ -87,11 +83,11 @@ class Task(ReadOnlyArrays, ABC):
         return moved
 
     def predict_one(self, plant: LinearPlant, task_state: Any, u: np.ndarray) -> Any:
-        """Returns what `predict` does, which cannot write into the task's state."""
+        """Returns `predict` of a task's state that it cannot write into."""
         return self.predict(plant, _own(task_state), u)
 
     def predict_many(self, plant: LinearPlant, task_state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns what `predict_one` does for inputs (m, N) of N environments."""
+        """Returns `predict_one` for inputs (m, N) of N environments."""
         if self.vectorized:
             return self.predict_one(plant, task_state, u)
         predicted = np.empty_like(task_state)
@@ -106,11 +102,7 @@ class Task(ReadOnlyArrays, ABC):
         return np.array([self.observe(each) for each in task_state], dtype=np.float64).T
 
     def reward_one(self, plant: LinearPlant, task_state: Any, state: np.ndarray, u: np.ndarray) -> float:
-        """Returns `reward` as a number; it cannot write into the state.
-
-        Raises:
-            ValueError: If it is no number; that of a state that ran away is infinite.
-        """
+        """Returns `reward` of a read-only state; raises ValueError if it is no number (infinity is one)."""
         value = self.reward(plant, task_state, guarded(state), u)
         try:
             reward = nan if getattr(value, "ndim", 0) else float(value + 0.0)
@@ -121,11 +113,7 @@ class Task(ReadOnlyArrays, ABC):
         return reward
 
     def reward_many(self, plant: LinearPlant, task_state: np.ndarray, state: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Returns what `reward_one` does for states (n, N) and inputs (m, N): a new array of shape (N,).
-
-        Raises:
-            ValueError: If a reward is no number, or there are not N.
-        """
+        """Returns `reward_one` for states (n, N) and inputs (m, N), shape (N,)."""
         state = guarded(state)
         if not self.vectorized:
             each = zip(task_state, state.T, u.T, strict=True)
@@ -145,5 +133,5 @@ class Task(ReadOnlyArrays, ABC):
 
 
 def _own(task_state: Any) -> Any:
-    """Returns a task's state for code of others: an array that it cannot write into, a copy of anything else."""
+    """Returns a task's state for code of others: a read-only array, or a copy of anything else."""
     return guarded(task_state) if isinstance(task_state, np.ndarray) else deepcopy(task_state)

@@ -21,12 +21,10 @@ class SetpointTracking(Task):
 
     The reward is 1 - min(|c x - target| / width, 1) at the end of the step, so that every step survived pays, less
     `change_price` times the change of the input in units of its limit (of several inputs the mean). The observation
-    gains the target, then the targets of the next `preview` steps, then, where its changes have a price, the last
-    input. The task's state is the target, a number or shape (N,); with a preview or a price it holds the targets, the
-    last input and what it was changed by, shape (k,) or (k, N).
-
-    Every target can be held: a plant that has no equilibrium at the outermost one within its safe box and input limits
-    is refused.
+    gains the target, the targets of the next `preview` steps and, where its changes have a price, the last input. The
+    task's state is the target, a number or shape (N,); with a preview or a price it holds the targets, the last input
+    and what it was changed by, shape (k,) or (k, N). A plant without an equilibrium at the outermost target within its
+    limits is refused.
 
     Attributes:
         output: The row c of the output c x that follows the target, shape (n,).
@@ -128,7 +126,7 @@ class SetpointTracking(Task):
 def _smallest_equilibria_hold(plant: LinearPlant, output: np.ndarray, reach: float) -> bool:
     """Returns whether the smallest states and inputs at rest with c x = +-reach are within the limits.
 
-    That is enough for c x = +-reach to be held, and takes no linear program.
+    That is enough, and takes no linear program.
     """
     scale = np.concatenate([plant.half_widths, plant.input_half])
     balance = np.hstack([np.eye(plant.n) - plant.A, -plant.B]) / plant.half_widths[:, None]
@@ -145,15 +143,7 @@ def _smallest_equilibria_hold(plant: LinearPlant, output: np.ndarray, reach: flo
 
 
 def farthest_equilibrium(plant: LinearPlant, output: np.ndarray) -> float:
-    """Returns up to where c x = +-r holds for some x = A x + B u within the limits, by two linear programs.
-
-    Args:
-        plant: The plant.
-        output: c, shape (n,).
-
-    Returns:
-        Infinity where nothing limits it.
-    """
+    """Returns up to where c x = +-r, c of shape (n,), holds for some x = A x + B u within the limits, or infinity."""
     from scipy.optimize import linprog  # takes long to import
 
     n, m = plant.n, plant.m

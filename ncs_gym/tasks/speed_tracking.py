@@ -86,5 +86,5 @@ class SpeedTracking(Task):
 
 
 def _entries(task_state: np.ndarray) -> Any:
-    """Returns speed and target: numbers of one vehicle, which are added in a third of the time, arrays (N,) of many."""
+    """Returns speed and target: of one vehicle as numbers, which are added in a third of the time."""
     return task_state.tolist() if task_state.ndim == 1 else task_state

@@ -1,7 +1,7 @@
-"""What acts on the plant inside the bound that the certificates assume: the base class, the kinds, and the checks.
+"""What acts on the plant inside the bound that certificates assume.
 
-Ball, box and sinusoid stay within the ball and the other sets that a plant's bounds declare, and truncated process
-noise is added to them. Sphere and adversary use the whole of E(D), process noise included.
+Ball, box and sinusoid stay within the ball and the other sets that a plant declares, and truncated process noise is
+added. Sphere and adversary use the whole of E(D), process noise included.
 """
 
 from __future__ import annotations
@@ -32,8 +32,7 @@ from ncs_gym.validation import (
 ROUNDING = 1e-12
 # A disturbance outside E(D) by no more than this is taken for rounding and scaled back onto it.
 TOLERANCE = 1e-9
-# How the noise of a plant may be drawn: inside the bounds that its covariances are truncated at, without a bound, or
-# with sensor noise and first errors on their bounds.
+# How noise may be drawn: inside its truncation, without a bound, or with sensor noise and first errors on their bounds.
 NOISES = ("truncated", "gaussian", "extreme")
 
 
@@ -41,16 +40,13 @@ class Disturbance(ReadOnlyArrays, ABC):
     """A disturbance in the ball d'd <= `gamma` of a plant plus its `disturbance_bound`; process noise is added to it.
 
     `begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores anything in the
-    settings, so that one object serves any number of environments; a vector environment refuses what does. The class
-    attributes below are never inherited: a subclass that overrides a method without declaring them anew is called for
-    one environment at a time.
+    object, which any number of environments share. A subclass does not inherit the class attributes below.
 
     Attributes:
-        replaces_process_noise: Whether the whole of E(D) is used, process noise included. The environment checks what
-            does not come from this package at every step.
+        replaces_process_noise: Whether the whole of E(D) is used, process noise included.
         vectorized: Whether the methods also take arrays whose last axis is the environment.
-        memoryless: Whether d depends on nothing but chance, so that many steps can be drawn at once; `draw` is then
-            called with an array of the right shape, without state, step and memory.
+        memoryless: Whether d depends on chance alone; `draw` is then called ahead, with an array of the right shape in
+            place of A x + B u, and None for step and memory.
     """
 
     replaces_process_noise: ClassVar[bool] = False
@@ -58,20 +54,20 @@ class Disturbance(ReadOnlyArrays, ABC):
     memoryless: ClassVar[bool] = False
 
     def __init_subclass__(cls, **keywords: Any) -> None:
-        """Keeps a subclass from inheriting a promise about methods that it may override."""
+        """Takes promises about methods from a subclass, which may override these."""
         super().__init_subclass__(**keywords)
         for name in ("vectorized", "memoryless", "replaces_process_noise"):
             setattr(cls, name, vars(cls).get(name, False))
 
     def begin(self, rng: np.random.Generator, plant: LinearPlant, size: int | None = None) -> Any:
-        """Returns what stays fixed for one episode (nothing unless overridden); last axis `size` if vectorized."""
+        """Returns what stays fixed for one episode; last axis `size` if vectorized. Nothing by default."""
         return np.zeros((0,) if size is None else (0, size))
 
     @abstractmethod
     def draw(
         self, rng: np.random.Generator, plant: LinearPlant, nominal_next: np.ndarray, step: Any, memory: Any
     ) -> np.ndarray:
-        """Returns d, shape (n,); shape (n, N) if vectorized and called for N environments.
+        """Returns d, shape (n,), or (n, N) if vectorized.
 
         Args:
             rng: Source of randomness.
@@ -121,7 +117,7 @@ class BoxDisturbance(Disturbance):
     """Uniform in a box (Liu et al. Section 5).
 
     Attributes:
-        half_widths: Shape (n,); the box must lie in the ball d'd <= gamma plus the plant's `disturbance_bound`. None:
+        half_widths: Shape (n,), of a box in the ball d'd <= gamma plus the plant's `disturbance_bound`. None:
             sqrt(gamma / n) each, plus uniform in the box inside that bound: where it was given by half-widths, these.
 
     Raises:
@@ -196,26 +192,15 @@ class SinusoidDisturbance(Disturbance):
 
 
 def sample_box(bound: Ellipsoid, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
-    """Returns points that are uniform in the box inside an ellipsoid along its principal axes.
-
-    For a bound given by half-widths that is the box of these half-widths.
-
-    Args:
-        bound: The ellipsoid.
-        rng: Source of randomness.
-        count: Number of points; None for a single one.
-
-    Returns:
-        Shape (n,), or (n, count).
-    """
+    """Returns points, shape (n,) or (n, count), uniform in the box inside an ellipsoid along its principal axes."""
     axes = bound.factor * bound.drawn_axes / np.sqrt(np.count_nonzero(bound.drawn_axes))
     return axes @ rng.uniform(-1.0, 1.0, bound.dim if count is None else (bound.dim, count))
 
 
 def diagonal_inside(bound: Ellipsoid) -> np.ndarray:
-    """Returns the diagonal shape of an ellipsoid inside one, shape (n, n): that itself if its axes are the coordinates.
+    """Returns the diagonal shape of an ellipsoid inside one, shape (n, n): P if it is diagonal, else j diag(P).
 
-    It is j diag(P), j the smallest eigenvalue of P in units in which its diagonal is 1.
+    j is the smallest eigenvalue of P in units in which its diagonal is 1.
     """
     variances = np.diag(bound.shape_matrix)
     kept = variances > 0.0
@@ -300,11 +285,7 @@ class AdversarialDisturbance(Disturbance):
 
 @dataclass(frozen=True, eq=False)
 class CallableDisturbance(Disturbance):
-    """A user's function (rng, plant, nominal_next) -> d, shape (n,).
-
-    Attributes:
-        function: Called once a step.
-    """
+    """A user's function (rng, plant, nominal_next) -> d, shape (n,)."""
 
     function: Callable[[np.random.Generator, LinearPlant, np.ndarray], np.ndarray]
     replaces_process_noise: ClassVar[bool] = True
@@ -322,16 +303,11 @@ BY_NAME: dict[str, type[Disturbance]] = {
 }
 
 
-def stays_inside(source: Disturbance) -> bool:
-    """Returns whether a disturbance lies in E(D) by construction: that of the classes with a name does."""
-    return type(source) in BY_NAME.values()
-
-
 def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: bool) -> Disturbance:
-    """Returns the settings for a name, a `Disturbance` or a callable (rng, plant, nominal_next) -> d.
+    """Returns the disturbance of a name, a `Disturbance` or a callable (rng, plant, nominal_next) -> d.
 
     Raises:
-        ValueError: If the name is unknown, the value is none of these, or it does not suit the plant.
+        ValueError: If it is none of these, or does not suit the plant.
     """
     if isinstance(value, str) and value in BY_NAME:
         value = BY_NAME[value]()
@@ -348,11 +324,10 @@ def as_disturbance(value: Any, plant: LinearPlant, allow_assumption_violation: b
 
 
 def as_noise(value: Any, plant: LinearPlant) -> str:
-    """Returns "truncated", "gaussian" or "extreme", checked.
+    """Returns one of `NOISES`.
 
-    "gaussian" draws what a covariance describes, which is process noise, sensor noise and first error, from the
-    Gaussian itself. What other sets bound has no distribution beyond them and stays inside. "extreme" draws sensor
-    noise and first errors in random directions on the boundary of what is assumed of them.
+    "gaussian" draws from the Gaussian itself; what other sets bound stays inside. "extreme" draws sensor noise and
+    first errors in random directions on the boundary of what is assumed of them.
 
     Raises:
         ValueError: If it is another value, or "gaussian" for a plant without any covariance.
@@ -361,15 +336,12 @@ def as_noise(value: Any, plant: LinearPlant) -> str:
         raise ValueError(f"noise must be one of {list(NOISES)}, got {shown(value)}")
     covariances = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
     if value == "gaussian" and not any(np.any(each) for each in covariances):
-        raise ValueError(
-            'noise="gaussian" needs a covariance of process noise, sensor noise or first error: this plant declares '
-            "bounds only, beyond which nothing says how likely anything is"
-        )
+        raise ValueError('noise="gaussian" needs a Gaussian among the bounds of the plant')
     return value
 
 
 def checked(plant: LinearPlant, d: Any, count: int | None = None, *, allow_assumption_violation: bool) -> np.ndarray:
-    """Returns disturbances as an array, shape (n,) or (n, count), inside E(D), scaled back to leave room for rounding.
+    """Returns disturbances, shape (n,) or (n, count), inside E(D), scaled back to leave room for rounding.
 
     Raises:
         ValueError: If one is not finite, wrongly shaped, or further outside than TOLERANCE and that is not allowed.

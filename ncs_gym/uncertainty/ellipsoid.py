@@ -17,13 +17,12 @@ if TYPE_CHECKING:
 
 # Directions whose variance is below this fraction of the largest count as flat: about 100 float64 roundings.
 FLAT = 2e-14
-# Points are not drawn along axes whose variance is below this fraction of the largest: so thin is the room for rounding
-# that a declared bound without an extent there was given (`LinearPlant`, a disturbance with two ends).
+# Points are not drawn along axes whose variance is below this fraction of the largest: that is room for rounding.
 THIN = 1e-7
 # A point this far off a flat ellipsoid, relative to its extent, still counts as rounding.
 OFF_FLAT = 1e-12
-# Newton's method for farthest points converges in about five steps, near the hard case in at most 25 of those tried;
-# a step below this fraction of nu is rounding.
+# Newton's method for farthest points converges in about five steps, near the hard case in at most 25 of those tried; a
+# step below this fraction of nu is rounding.
 NEWTON_STEPS, NEWTON_PRECISION = 40, 1e-15
 # A farthest point whose squared length lacks more than this is in the hard case.
 HARD_CASE = 1e-9
@@ -33,9 +32,9 @@ class UncertainSet(ReadOnlyArrays, ABC):
     """A set of vectors z, shape (n,).
 
     Attributes:
-        size: n; None while a number stands for as many entries as there are (see `sized`).
+        size: n; None while a number stands for as many entries as there are (`sized`).
         middle: Shape (n,): zero but for boxes with two different ends.
-        is_left_out: Whether it bounds what a model leaves out of the process, which holds only inside the limits.
+        is_left_out: Whether it bounds what a model leaves out of the process, inside the limits alone.
         kinds: The classes of sets, by their names in documents.
     """
 
@@ -51,7 +50,7 @@ class UncertainSet(ReadOnlyArrays, ABC):
         UncertainSet.kinds[cls.__name__] = cls
 
     def sized(self, size: int) -> Any:
-        """Returns the set of vectors with so many entries; raises ValueError if it has another number of them."""
+        """Returns the set of vectors with so many entries; raises ValueError if it has another number."""
         if self.size not in (None, size):
             raise ValueError(f"a set in dimension {size} is needed, got one in dimension {self.size}")
         return self
@@ -74,7 +73,7 @@ class UncertainSet(ReadOnlyArrays, ABC):
 
     @property
     def document(self) -> dict[str, Any]:
-        """The set as JSON values, every number exact, which `as_set` reads."""
+        """JSON values, every number exact, which `as_set` reads."""
         return {type(self).__name__: {each.name: document_of(getattr(self, each.name)) for each in fields(self)}}  # type: ignore[arg-type]
 
     def __add__(self, other: Any) -> Any:
@@ -85,7 +84,7 @@ class UncertainSet(ReadOnlyArrays, ABC):
 
 
 def document_of(value: Any) -> Any:
-    """Returns what has a document, or is a part of one, as JSON values in which infinity is the text "inf"."""
+    """Returns a document, or a part of one, as JSON values in which infinity is the text "inf"."""
     if hasattr(value, "document"):
         return document_of(value.document)
     if isinstance(value, tuple | list):
@@ -108,16 +107,13 @@ def read_back(value: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid(UncertainSet):
-    """The centered ellipsoid {z : a'z <= sqrt(a'Pa) for all a} with shape P.
-
-    For an invertible shape this is {z : z' P^-1 z <= 1}; a singular shape is a flat ellipsoid
-    (zero: the origin alone).
+    """The centered ellipsoid {z : a'z <= sqrt(a'Pa) for all a}: {z : z' P^-1 z <= 1}, flat where P is singular.
 
     Attributes:
-        shape_matrix: P, shape (n, n), symmetric positive semidefinite [square of the unit of z].
+        shape_matrix: P, shape (n, n) [square of the unit of z].
 
     Raises:
-        ValueError: If the shape is not a finite, symmetric, positive semidefinite square matrix.
+        ValueError: If it is not symmetric positive semidefinite.
     """
 
     shape_matrix: np.ndarray
@@ -142,7 +138,7 @@ class Ellipsoid(UncertainSet):
 
     @cached_property
     def _principal_axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Coordinate scales s, and eigenvalues and eigenvectors of P_ij / (s_i s_j)."""
+        """Scales s of coordinates, and eigenvalues and eigenvectors of P_ij / (s_i s_j)."""
         scale = np.sqrt(np.maximum(np.diag(self.shape_matrix), 0.0))
         divisor = np.where(scale > 0.0, scale, 1.0)
         values, vectors = np.linalg.eigh(self.shape_matrix / np.outer(divisor, divisor))
@@ -151,10 +147,7 @@ class Ellipsoid(UncertainSet):
 
     @cached_property
     def drawn_axes(self) -> np.ndarray:
-        """Which columns of the factor points are drawn along, shape (n,): those that are neither flat nor thin.
-
-        All of them for a single point, where it does not matter.
-        """
+        """Which columns of the factor points are drawn along, shape (n,): those neither flat nor thin."""
         _, values, _ = self._principal_axes
         return (values > THIN * values[-1]) | (not values.any())
 
@@ -165,17 +158,13 @@ class Ellipsoid(UncertainSet):
         return float(value) if value.ndim == 0 else value
 
     def extreme_point(self, direction: np.ndarray) -> np.ndarray:
-        """Returns a point of the ellipsoid, shape (n,), that attains the support in `direction`."""
+        """Returns a point, shape (n,), that attains the support in a direction."""
         image = self.shape_matrix @ direction
         height = np.sqrt(max(float(direction @ image), 0.0))
         return image / height if height > 0.0 else np.zeros(self.dim)
 
     def gauge(self, points: ArrayLike) -> Any:
-        """Returns sqrt(z' P^-1 z): 0 at the center, 1 on the boundary, infinite off a flat ellipsoid.
-
-        Args:
-            points: z, shape (n,), which gives a float, or (count, n), which gives shape (count,).
-        """
+        """Returns sqrt(z' P^-1 z) of a point, shape (n,), or of each of (count, n); infinite off a flat ellipsoid."""
         scale, values, vectors = self._principal_axes
         points = np.asarray(points, dtype=np.float64)
         coordinates = (points / np.where(scale > 0.0, scale, 1.0)) @ vectors
@@ -186,35 +175,25 @@ class Ellipsoid(UncertainSet):
         return float(gauges) if gauges.ndim == 0 else gauges
 
     def contains(self, point: np.ndarray) -> bool:
-        """Returns whether a point, shape (n,), lies inside or on the boundary (in float64, no tolerance)."""
+        """Returns whether a point, shape (n,), lies inside or on the boundary, without a tolerance."""
         return self.gauge(point) <= 1.0
 
     def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
-        """Returns a uniformly distributed point, shape (n,), or `count` of them, shape (count, n)."""
+        """Returns a uniform point, shape (n,), or `count` of them, (count, n)."""
         radius = rng.random(None if count is None else (count, 1)) ** (1.0 / np.count_nonzero(self.drawn_axes))
         return self.sample_boundary(rng, count) * radius
 
     def sample_boundary(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
-        """Returns boundary points, shape (n,) or (count, n): images of uniform directions of the unit sphere.
-
-        Of a flat ellipsoid they lie on its own boundary, not inside it: the sphere has as many dimensions as it.
-        """
+        """Returns boundary points, shape (n,) or (count, n): images of uniform directions of the drawn axes."""
         directions = rng.standard_normal(self.dim if count is None else (count, self.dim)) * self.drawn_axes
         return (directions / np.linalg.norm(directions, axis=-1, keepdims=True)) @ self.factor.T
 
     def farthest_point(self, centers: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        """Returns z of the ellipsoid that maximizes (center + z)' W (center + z).
+        """Returns the z that maximize (center + z)' W (center + z), for centers of shape (n,) or (count, n).
 
         With z = G s and G'WG = V diag(values) V' it solves (nu I - G'WG) s = G'W center, |s| = 1, nu >= max(values):
-        the trust-region problem with its sign turned. Where the center does not pull along the longest axis (the hard
-        case), that axis takes what is missing to length 1.
-
-        Args:
-            centers: Shape (n,) or (count, n).
-            weight: W, shape (n, n), symmetric positive semidefinite.
-
-        Returns:
-            The maximizers, of the shape of `centers`.
+        the trust-region problem with its sign turned. In the hard case the center does not pull along the longest axis,
+        which takes what is missing to length 1.
         """
         values, vectors = np.linalg.eigh(self.factor.T @ weight @ self.factor)
         axes = self.factor @ vectors
@@ -224,12 +203,7 @@ class Ellipsoid(UncertainSet):
 
 
 def farthest_coordinates(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Returns the s, |s| <= 1, that maximize s' diag(values) s + 2 slope's, in columns, shape (n, count).
-
-    Args:
-        slopes: Shape (n, count).
-        values: Ascending, shape (n,).
-    """
+    """Returns the s, |s| <= 1, that maximize s' diag(values) s + 2 slope's, for slopes (n, count), values ascending."""
     coordinates = slopes / (_trust_region_root(slopes, values) - values[:, None])
     squares = np.square(coordinates).sum(axis=0)
     coordinates = np.where(np.isfinite(squares), coordinates, 0.0)
@@ -244,12 +218,7 @@ def _trust_region_root(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns nu >= max(values) with sum_i (slope_i / (nu - value_i))^2 = 1 for each column of slopes, shape (count,).
 
     The norm as a function of nu is convex and falling, its inverse concave: Newton's method on 1/norm from the left of
-    the root rises monotonically. Every term of the sum is at most 1, which is where it starts. A column that has
-    converged moves no more, so that it does not depend on the others.
-
-    Args:
-        slopes: Shape (n, count).
-        values: Ascending, shape (n,).
+    the root, where every term is at most 1, rises monotonically. A column that has converged moves no more.
     """
     values = values[:, None]
     length = np.sqrt(np.square(slopes).sum(axis=0))
@@ -270,7 +239,7 @@ def _trust_region_root(slopes: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def ellipsoid_around_sum(weight: np.ndarray, first: Ellipsoid, *others: Ellipsoid | None) -> Ellipsoid:
-    """Returns an ellipsoid around the sum, one after the other of the smallest tr(W P); points and None add nothing."""
+    """Returns an ellipsoid around the sum, one by one of the smallest tr(W P); points and None add nothing."""
     total = first
     for each in others:
         if each is not None and np.any(each.shape_matrix):

@@ -28,18 +28,14 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Family(ReadOnlyArrays):
-    """Plants x+ = A_i x + B_i u + s_i + d, told apart by parameters (`ncs_gym.family`).
-
-    All are in deviations from one point; s_i is the step of a member there, which is at rest at another one.
+    """Plants x+ = A_i x + B_i u + s_i + d in deviations from one point, where the step is s_i (`ncs_gym.family`).
 
     Attributes:
-        names: Names of the parameters; "member", which counts from 0, for plants without any.
-        parameters: Their values for the members that are listed, shape (N, k): plants, or the corners of a function.
+        names: Of the parameters; "member", which counts from 0, for plants without any.
+        parameters: Of the members listed, shape (N, k): plants, or the corners of a function.
         members: [A_i, B_i, s_i] of these, shape (N, n, n + m + 1).
-        function: Returns the plant of parameters between those listed; None if there are no others. No file holds it:
-            a family that was read from one is that of the members listed.
-        interval: The low and the high entries of [A, B, s] of all that the function returns, shape (2, n, n + m + 1);
-            None without one.
+        function: Returns the plant of parameters between those listed; None if there are no others. No file holds it.
+        interval: Low and high entries of [A, B, s] of all that the function returns, shape (2, n, n + m + 1).
         center: State and input that deviations are counted from, shape (n + m,); None is zero.
         at_rest: Whether it is given that every member rests at its own operating point.
         check: Raises ValueError unless a plant that the function returned differs from the others in [A, B, s] alone.
@@ -60,17 +56,14 @@ class Family(ReadOnlyArrays):
     def __post_init__(self) -> None:
         members, interval = as_numbers(self.members), self.interval
         if members is None or members.ndim != 3 or not len(members) or not np.isfinite(members).all():
-            raise ValueError(
-                f"the members of a family must be finite with shape (N, n, n + m + 1), got {shown(members)}"
-            )
+            raise ValueError(f"members of a family must be finite, shape (N, n, n + m + 1), got {shown(members)}")
         parameters = as_matrix(self.parameters, (len(members), None), "the parameters of a family")
         default = tuple(f"p{number + 1}" for number in range(parameters.shape[1]))
         names = as_names(self.names, default, "the names of parameters")
         of_plants = interval is None and self.function is None
         if of_plants != (names == ("member",)) or (self.function is not None and (interval is None or not self.check)):
             raise ValueError(
-                "a family of parameters needs the interval of its entries, and that of a function the check of its "
-                "members; a family of plants has neither"
+                "a family of parameters needs interval, one of a function check, and one of plants neither"
             )
         if interval is not None:
             interval = as_numbers(interval)
@@ -84,7 +77,7 @@ class Family(ReadOnlyArrays):
 
     @property
     def document(self) -> dict[str, Any]:
-        """What a file holds: all but the function, so that a family read from one is that of the members listed."""
+        """What a file holds: all but the function. A family read from it is that of the members listed."""
         names = "names", "parameters", "members", "interval", "center", "at_rest"
         return {name: getattr(self, name) for name in names}
 
@@ -92,20 +85,14 @@ class Family(ReadOnlyArrays):
         """Returns what the plant of the middle leaves out of every member, in the dimension of its own states.
 
         Raises:
-            ValueError: If members are of another size or about another point, move past inputs otherwise, or differ in
-                what an unlimited state does.
+            ValueError: If members do not fit the plant, or differ in what an unlimited state does.
         """
         n, size = plant.n, (plant.n, plant.n + plant.m + 1)
         point = np.concatenate([plant.operating_state, plant.operating_input])
         if self.members.shape[1:] != size:
-            raise ValueError(
-                f"the members of the family must be [A, B, s] of shape {size}, got {self.members.shape[1:]}"
-            )
+            raise ValueError(f"members of the family must be [A, B, s] of shape {size}, got {self.members.shape[1:]}")
         if not np.array_equal(point, np.zeros(len(point)) if self.center is None else self.center):
-            raise ValueError(
-                "the members of the family are in deviations from another operating point than that of this plant "
-                "(which the middle of a disturbance moves): make the family anew of members that rest there"
-            )
+            raise ValueError("the members of the family are in deviations from another operating point: make it anew")
         listed = self.members if self.interval is None else self.interval
         off = np.abs(listed - np.column_stack([plant.A, plant.B, np.zeros(n)]))
         if self.interval is not None:
@@ -115,10 +102,7 @@ class Family(ReadOnlyArrays):
             raise ValueError("the members of the family must have the past inputs of the plant of the middle")
         differs, reach = off.any(axis=(0, 1)), np.append(plant.reach, 1.0)
         if free := np.flatnonzero(differs & np.isinf(reach)).tolist():
-            raise ValueError(
-                f"the members differ in what {plant.state_names[free[0]]} does, which no row of the box with two ends "
-                "limits: give it limits, if generous ones"
-            )
+            raise ValueError(f"the members differ in what {plant.state_names[free[0]]} does: give it generous limits")
         reach = np.where(differs, reach, 0.0)
         sizes = (1.0 + ROUNDING) * np.max([exact.product(each, reach) for each in off], axis=0)[:own]
         sides = [Box(-row, row).ellipsoid().shape_matrix for row in np.diag(sizes) if row.any()]
@@ -129,7 +113,7 @@ class Family(ReadOnlyArrays):
 
     @property
     def basis(self) -> str:
-        """Which plants the bound of the family is for, and what is given of them, in a phrase."""
+        """Which plants the bound is for, and what is given of them, in a phrase."""
         if self.interval is None:
             text = f"for the convex hull of {len(self.members)} plants"
         else:
@@ -154,8 +138,8 @@ class Family(ReadOnlyArrays):
         """Returns the parameters that an option of `reset` fixes, shape (k,) or (size, k); NaN where it fixes none.
 
         Args:
-            given: A dictionary of some parameters, each a number or, for many environments, shape (size,); None for
-                an empty one. Or all of them in the order of `names`, shape (k,) or (size, k), as infos have them.
+            given: A dictionary of some parameters, each a number or shape (size,), or None; or all of them in the order
+                of `names`, shape (k,) or (size, k), as infos have them.
             size: Number of environments; None without that axis.
             anywhere: Whether parameters beyond their ranges are allowed.
 
@@ -167,9 +151,8 @@ class Family(ReadOnlyArrays):
         if in_order is not None and in_order.shape in ((len(self.names),), (size, len(self.names))):
             given = dict(zip(self.names, in_order.T, strict=True))
         if given is not None and not (isinstance(given, Mapping) and set(given) <= set(self.names)):
-            raise ValueError(
-                f"options['parameters'] must be a dictionary of {list(self.names)}, or all of them, got {shown(given)}"
-            )
+            form = f"a dictionary of {list(self.names)}, or all of them"
+            raise ValueError(f"options['parameters'] must be {form}, got {shown(given)}")
         for name, value in (given or {}).items():
             numbers, column = as_numbers(value), self.names.index(name)
             if numbers is None or numbers.shape not in ((), (size,)) or not np.isfinite(numbers).all():
@@ -178,8 +161,8 @@ class Family(ReadOnlyArrays):
             low, high = self.ranges[:, column].tolist()
             if self.function is not None and not anywhere and ((numbers < low) | (numbers > high)).any():
                 raise ValueError(
-                    f"{name} must be between {low:g} and {high:g}, for which the family's bound is proved, got "
-                    f"{shown(value)}: allow_assumption_violation=True lets others move"
+                    f"{name} must be between {low:g} and {high:g}, got {shown(value)} "
+                    "(allow_assumption_violation=True lets others move)"
                 )
             values[:, column] = numbers
         if self.function is None:
@@ -188,12 +171,7 @@ class Family(ReadOnlyArrays):
         return values[0] if size is None else values
 
     def drawn(self, rng: np.random.Generator, fixed: np.ndarray) -> np.ndarray:
-        """Returns the parameters of a member, shape (k,): uniform in their ranges, or one of the members listed.
-
-        Args:
-            rng: Source of randomness.
-            fixed: Parameters, shape (k,); NaN for those that are drawn.
-        """
+        """Returns the parameters of a member, shape (k,), those drawn that are NaN: uniformly, or from those listed."""
         if self.function is None:
             rows = self._fitting(fixed)
             return self.parameters[rows[rng.integers(len(rows))]]
@@ -212,18 +190,12 @@ class Family(ReadOnlyArrays):
             outside = (matrices < self.interval[0]) | (matrices > self.interval[1])
             if outside.any():
                 given = dict(zip(self.names, parameters.tolist(), strict=True))
-                raise ValueError(
-                    f"{entry_name(outside)} at {shown(given)} is not between those at the ends of the ranges: it is no "
-                    "monotone entry, as monotone=True says"
-                )
+                where = f"{entry_name(outside)} at {shown(given)}"
+                raise ValueError(f"{where} is not between those at the ends of the ranges, as monotone=True says")
         return matrices
 
     def of_function(self, parameters: np.ndarray) -> np.ndarray:
-        """Returns [A, B, s] of the plant that the function returns, shape (n, n + m + 1), within the ranges or not.
-
-        Raises:
-            ValueError: If that plant is no member by `check`.
-        """
+        """Returns [A, B, s] of the plant that the function returns, within the ranges or not, if `check` lets it."""
         assert self.function is not None
         shape = self.members.shape[1:]
         with warnings.catch_warnings():
@@ -244,17 +216,14 @@ class Family(ReadOnlyArrays):
 
 
 def grid_size(parameters: int) -> int:
-    """Returns at how many values of each parameter a function is looked at."""
+    """Returns at how many values of each parameter `monotone` is checked."""
     return max(int(GRID ** (1.0 / parameters) + 1e-9), 3)
 
 
 def matrices_of(plant: LinearPlant, shape: tuple[int, ...], center: np.ndarray) -> np.ndarray:
-    """Returns [A, B, s] of a plant in deviations from a state and input, (n + m,), where its step is s.
+    """Returns [A, B, s] of a plant in deviations from a state and input, (n + m,), or raises ValueError.
 
     It is at rest at its own operating point (x_i, u_i): s = (A - I)(x - x_i) + B (u - u_i), rounded once.
-
-    Raises:
-        ValueError: If it is of another shape.
     """
     A, B, (n, m) = plant.A, plant.B, plant.B.shape
     if (n, n + m + 1) != shape:
@@ -266,10 +235,7 @@ def matrices_of(plant: LinearPlant, shape: tuple[int, ...], center: np.ndarray) 
 
 
 def entry_name(chosen: np.ndarray) -> str:
-    """Returns what the first entry of [A, B, s] that is chosen, shape (n, n + m + 1), is called.
-
-    A[0, 1] or B[0, 0]; of s, what it is.
-    """
+    """Returns the name of the first entry of [A, B, s] that is chosen, shape (n, n + m + 1)."""
     (row, column), n = np.argwhere(chosen)[0].tolist(), len(chosen)
     if column == chosen.shape[1] - 1:
         return f"state {row + 1} of the step from the middle of the operating points"

@@ -16,19 +16,15 @@ from ncs_gym.validation import as_flag, require_short_text, shown
 
 @dataclass(frozen=True, eq=False)
 class Remainder(UncertainSet):
-    """f(x, u) - A x - B u lies in an ellipsoid, for x in the safe box and u within its limits (both in common ones).
+    """f(x, u) - A x - B u lies in an ellipsoid, for x and u within the limits: a part of `Bounds.disturbance`.
 
-    It is a part of `Bounds.disturbance`. The one that a plant keeps belongs to the model and the limits of that plant,
-    and no plant of others takes it over.
-    Of a family, the plant works the bound out of the members itself.
+    It belongs to the model and the limits of one plant. That of a family is worked out from the members.
 
     Attributes:
-        bound: E(R) around the remainder, in units of the state.
-        proved: Whether the bound follows from the equations of the process; False if it was found by sampling, so that
-            every certificate *assumes* it.
+        bound: E(R), in units of the state.
+        proved: Whether the bound follows from the equations of the process; if it was sampled, certificates assume it.
         basis: Where the bound comes from, in a phrase.
-        family: The plants that the process is one of, of which each episode has another (`ncs_gym.family`); None if it
-            is something else.
+        family: The plants of which each episode has another (`ncs_gym.family`); None if the process is something else.
         belongs_to: `LinearPlant.region` of the plant that it belongs to; None before any has it.
 
     Raises:
@@ -55,18 +51,13 @@ class Remainder(UncertainSet):
         return self.bound
 
     def of_plant(self, plant: Any) -> Remainder:
-        """Returns the same remainder, which from now on belongs to this plant alone; that of a family anew.
-
-        Raises:
-            ValueError: If it belongs to another plant.
-        """
+        """Returns the same remainder as that of this plant, of a family anew; raises ValueError if it is another's."""
         if self.family is not None:
             return Remainder(self.family.bound_for(plant), True, self.family.basis, self.family)
         if self.belongs_to not in (None, plant.region):
             raise ValueError(
-                "the remainder belongs to a plant with another model, other limits or another operating point (which "
-                "the middle of a disturbance moves): find the model anew by ncs_gym.linear_model, or give "
-                "Remainder(bound, proved, basis) anew if it holds for this plant, too"
+                "the remainder belongs to a plant with another model, limits or operating point: find the model anew "
+                "by ncs_gym.linear_model, or give Remainder(bound, proved, basis) anew if it holds for this plant, too"
             )
         return self if self.belongs_to else replace(self, belongs_to=plant.region)
 

@@ -19,9 +19,8 @@ FEW, CLEARLY = 6, 1e-9
 def is_inside(inner: np.ndarray, outer: np.ndarray) -> bool:
     """Returns whether E(inner) is shown to be a subset of E(outer): outer - inner >= 0 in exact arithmetic.
 
-    What is said to be inside is inside: what the rounding of this test could have decided counts as outside, so that
-    proofs that begin with "it lies inside" need no room. Every entry of a difference is exact but for its own last
-    digit, hence its sign, a zero and a diagonal difference are exact; a set lies inside itself.
+    What the rounding of this test could have decided counts as outside. Every entry of a difference is exact but for
+    its own last digit, hence its sign, a zero and a diagonal difference are exact; a set lies inside itself.
     """
     difference = outer - inner
     if 2 < len(difference) <= FEW and _has_clear_pivots(difference.tolist(), outer.diagonal().tolist()):
@@ -46,15 +45,11 @@ def is_inside(inner: np.ndarray, outer: np.ndarray) -> bool:
 
 
 def _has_clear_pivots(rows: list[list[float]], scales: list[float]) -> bool:
-    """Returns whether a difference of shapes is clearly positive definite, each row and column in units of the outer.
+    """Returns whether rows, which are overwritten, of outer minus inner shape are clearly positive definite.
 
-    In those units no entry of the diagonal exceeds 1. The product of the pivots is the determinant, and by the means of
-    the other eigenvalues the smallest one is at least det ((n-1)/n)^(n-1) > det / e; rounding moves it by less than
-    n (n+1) 2^-53.
-
-    Args:
-        rows: Outer minus inner shape, (n, n); it is overwritten.
-        scales: Diagonal of the outer shape.
+    In units of the outer shape, whose diagonal are the scales, no entry of the diagonal exceeds 1. The product of the
+    pivots is the determinant, and by the means of the other eigenvalues the smallest one is at least
+    det ((n-1)/n)^(n-1) > det / e; rounding moves it by less than n (n+1) 2^-53.
     """
     product = 1.0
     if not all(SMALLEST_PRODUCT < rows[k][k] <= scale for k, scale in enumerate(scales)):
@@ -72,15 +67,10 @@ def _has_clear_pivots(rows: list[list[float]], scales: list[float]) -> bool:
 
 
 def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Returns P1/nu + P2/(1-nu), an ellipsoid around E(P1) + E(P2), with the smallest tr(W P).
+    """Returns P1/nu + P2/(1-nu), an ellipsoid around E(P1) + E(P2), with the smallest tr(W P), W positive definite.
 
     Source: docs/shield_proof.md, "Sums" (Cauchy-Schwarz on the supports); the best multiplier is
     nu = sqrt(tr W P1) / (sqrt(tr W P1) + sqrt(tr W P2)).
-
-    Args:
-        first: P1, shape (n, n).
-        second: P2, shape (n, n).
-        weight: W, shape (n, n), positive definite, so that a zero trace means a zero shape.
     """
     a = np.sqrt(max(exact.total(weight * first), 0.0))
     b = np.sqrt(max(exact.total(weight * second), 0.0))
@@ -94,9 +84,7 @@ def outer_sum(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> np.n
 def joined(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Returns the smallest ellipsoid around two: in axes in which both are diagonal, the larger of each entry.
 
-    Args:
-        first: P1, shape (n, n), positive definite.
-        second: P2, shape (n, n), positive semidefinite.
+    The first is positive definite, the second semidefinite.
     """
     root = np.linalg.cholesky(first)
     inverse = np.linalg.inv(root)
@@ -107,11 +95,9 @@ def joined(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def rounded_up(shape: np.ndarray, digits: int) -> np.ndarray:
-    """Returns a slightly larger ellipsoid in round numbers: the diagonal added to exceeds what rounding takes away.
+    """Returns a slightly larger shape with so many digits relative to its extents, none of which is zero.
 
-    Args:
-        shape: P, shape (n, n), with a positive diagonal.
-        digits: Of every entry, relative to the extents of the ellipsoid.
+    What is added to the diagonal exceeds what rounding takes away.
     """
     extents = np.sqrt(np.diag(shape))
     unit = 10.0 ** (np.floor(np.log10(extents)) - digits // 2)

@@ -21,11 +21,10 @@ PRECISION = 128
 
 @dataclass(frozen=True, eq=False)
 class TruncatedGaussian(ReadOnlyArrays):
-    """w ~ N(0, covariance) conditioned on w' covariance^-1 w <= energy.
+    """w ~ N(0, covariance), shape (n, n), conditioned on w' covariance^-1 w <= energy.
 
     Attributes:
-        covariance: Shape (n, n), of the Gaussian before truncation.
-        energy: The largest squared Mahalanobis norm that is kept (`truncation_energy`).
+        covariance, energy: The same.
         known: How many of the last entries are known, and zero.
     """
 
@@ -38,24 +37,18 @@ class TruncatedGaussian(ReadOnlyArrays):
 
     @cached_property
     def bound(self) -> Ellipsoid:
-        """The ellipsoid that holds every sample: shape energy * covariance."""
+        """The ellipsoid that holds every truncated sample."""
         return Ellipsoid(self.energy * self.covariance)
 
     @cached_property
     def factor(self) -> np.ndarray | None:
-        """G with G G' = covariance, a column per unknown entry; None without noise: no random number is drawn then."""
+        """G with G G' = covariance, a column per unknown entry; None without noise, for which no number is drawn."""
         unknown = len(self.covariance) - self.known
         factor = Ellipsoid(self.covariance[:unknown, :unknown]).factor if np.any(self.covariance) else None
         return None if factor is None else np.pad(factor, ((0, self.known), (0, 0)))
 
     def sample(self, rng: np.random.Generator, count: int | None = None, *, truncated: bool = True) -> np.ndarray:
-        """Returns one draw, shape (n,), or `count` of them, shape (count, n), by rejection.
-
-        Args:
-            rng: Source of randomness.
-            count: Number of draws; None for a single one.
-            truncated: False draws from the Gaussian itself, which has no bound.
-        """
+        """Returns one draw, shape (n,), or `count` of them, (count, n), of the truncated Gaussian or of itself."""
         size = 1 if count is None else count
         if self.factor is None:
             points = np.zeros((size, self.covariance.shape[0]))
@@ -76,14 +69,7 @@ class TruncatedGaussian(ReadOnlyArrays):
 
 @cache
 def truncation_energy(delta: float, degrees: int) -> float:
-    """Returns chi2_{degrees, 1 - delta}, rounded up: the smallest float64 exceeded with at most probability delta.
-
-    Ball arithmetic decides on which side of it a float lies, so that it is the same on every machine.
-
-    Args:
-        delta: Probability that is cut off, in [1e-12, 0.999].
-        degrees: Degrees of freedom, >= 1.
-    """
+    """Returns chi2_{degrees, 1 - delta}, rounded up: the smallest float64 exceeded with at most probability delta."""
     low, high = 0.0, 1.0
     while _cuts_off_more(high, delta, degrees):
         low, high = high, 2.0 * high
@@ -93,7 +79,6 @@ def truncation_energy(delta: float, degrees: int) -> float:
 
 
 def _cuts_off_more(energy: float, delta: float, degrees: int) -> bool:
-    """Returns whether a chi-square variable exceeds an energy with more than the probability delta."""
     precision = PRECISION
     while True:
         with ctx.workprec(precision):

@@ -164,11 +164,7 @@ class BoardTable(ReadOnlyArrays):
 
 
 def _exported(certificate: Certificate, plant: LinearPlant) -> Updates:
-    """Returns what a contract adds to a certificate of a kind that is exported.
-
-    Raises:
-        CertificateError: If it is of another kind, in a sentence that names it.
-    """
+    """Returns what a contract adds to a certificate; raises CertificateError if its kind is not exported."""
     reasons = {
         "it has no polytope: give one of ncs synthesize --safe-set polytope": certificate.polytope is None,
         "it has no channel contract: give one of ncs synthesize --max-age": certificate.updates is None,

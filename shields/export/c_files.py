@@ -67,7 +67,6 @@ def _offsets(parts: list[tuple[str, np.ndarray]], end: str) -> list[str]:
 
 
 def _listed(parts: list[tuple[str, np.ndarray]], suffix: str) -> str:
-    """Returns all numbers as C has them."""
     return ",\n".join(", ".join(f"{value!r}{suffix}" for value in each.ravel().tolist()) for _, each in parts)
 
 

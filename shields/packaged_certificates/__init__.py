@@ -21,8 +21,8 @@ def certificate_for(
 ) -> Certificate:
     """Returns a certificate, found or synthesized once per process, plant, contract and kind of safe set.
 
-    Those of the registered environments come with the package. For another plant or contract one is synthesized, which
-    takes seconds to minutes, and standard error says so. It is not verified here; whatever uses it does that.
+    Those of the registered environments come with the package. Another one takes seconds to minutes, as standard error
+    says. It is not verified here.
 
     Args:
         plant: The plant.
@@ -43,11 +43,7 @@ def certificate_for(
 
 
 def certificate_of_package(plant: LinearPlant, contract: ChannelContract | None = None) -> Certificate | None:
-    """Returns the certificate that comes with the package for a plant and a contract; None if there is none.
-
-    Raises:
-        CertificateError: If its file is damaged.
-    """
+    """Returns the certificate that comes with the package for a plant and a contract; None if there is none."""
     for file in sorted(Path(__file__).parent.glob("*.json")):
         if plant.fingerprint in file.read_text(encoding="utf-8"):
             certificate = Certificate.load(file)

@@ -16,8 +16,8 @@ SMALLEST_GAP = 1e-9
 def uplink_error_bound(p0: float, q_bar: float, quantile: float, g2: float, rest: float) -> float:
     """Returns eps_up = (p0 g2 + q_bar / (1 - g2)) chi2_{n,1-delta} (Liu et al. Theorem 2).
 
-    It is a quantile per step: if the error is Gaussian, its square stays below the bound with probability 1 - delta at
-    each single step; "for all k" does not follow. The term p0 g2 is kept as printed, although p0 g2^k is p0 at k = 0.
+    It holds with probability 1 - delta at each single step; "for all k" does not follow. The term p0 g2 is kept as
+    printed, although p0 g2^k is p0 at k = 0.
 
     Args:
         p0: lambda_max(P0).
@@ -72,14 +72,14 @@ def with_noise(
     R: np.ndarray | None = None,
     P0: np.ndarray | None = None,
 ) -> LinearPlant:
-    """Returns a plant with a ball of disturbances and Gaussian noise, as the paper has them, some of them others.
+    """Returns a plant with a ball of disturbances and Gaussian noise, as the paper has them, some in place of its own.
 
     Args:
         plant: The plant, of which nothing else is declared.
-        gamma: Squared radius of the ball, in place of its own.
-        Q: Covariance of process noise, shape (n, n), alike.
-        R: Of sensor noise, shape (p, p), alike.
-        P0: Of the first error, shape (n, n), alike.
+        gamma: Squared radius of the ball.
+        Q: Covariance of process noise, shape (n, n).
+        R: Covariance of sensor noise, shape (p, p).
+        P0: Covariance of the first error, shape (n, n).
     """
     own = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
     given = zip((Q, R, P0), own, strict=True)

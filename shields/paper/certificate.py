@@ -28,8 +28,7 @@ class PaperCertificate(ReadOnlyArrays):
     """A set E(L) and a gain that meet the constraints of OP (Liu et al. Definition 4).
 
     It carries the guarantee of the paper's own definitions, which assumes e'e <= epsilon at every step. It has no error
-    set, so that no shield takes it: `shields.synthesis.certify(plant, L, K)` proves the same set and gain, if it can
-    be proved.
+    set, so that no shield takes it.
 
     Attributes:
         L: Shape of the ellipsoid, (n, n) [squares of the states' units].

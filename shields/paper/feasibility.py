@@ -23,10 +23,6 @@ _REDUCTION, _ATTEMPTS = 0.99, 20
 # Points of the scan that are tried with the communication error in the input limit.
 _CONFIRMED_POINTS = 100
 
-# Scans of the last few plants by their dynamics, since one takes seconds: who changes bounds asks for them again.
-_known_scans: dict[tuple, tuple[tuple[float, float, float], ...]] = {}
-_MAX_KNOWN_SCANS = 4
-
 
 class Feasibility(NamedTuple):
     """Largest lambda_min(L) / alpha at (kappa, rho), without the communication error in the input limit; OP needs 1."""
@@ -44,25 +40,11 @@ class FeasibilityScan:
     """
 
     def __init__(self, plant: LinearPlant) -> None:
-        key = tuple((array.shape, array.tobytes()) for array in (plant.A, plant.B, plant.box_rows, plant.u_max))
-        self._problem, points = OptimizationProblem(plant), _known_scans.get(key)
-        if points is None:
-            points = _scanned(self._problem)
-            for oldest in list(_known_scans)[: 1 - _MAX_KNOWN_SCANS]:
-                _known_scans.pop(oldest, None)
-            _known_scans[key] = points
-        self._points = points
+        self._problem = OptimizationProblem(plant)
+        self._points = _scanned(self._problem)
 
     def best(self, plant: LinearPlant, model: PaperModel | None = None) -> Feasibility:
-        """Returns the point of largest ratio for a plant with the scanned dynamics and bounds of its own.
-
-        Args:
-            plant: The plant whose uncertainty counts.
-            model: Constants of OP; those of the plant by default.
-
-        Raises:
-            LookupError: If no gain contracts any ellipsoid at any point: (C1) alone has no solution.
-        """
+        """Returns the point of largest ratio for the bounds of a plant, or for other constants of OP."""
         return self._ranked(model or PaperModel(plant))[0]
 
     def full_ratio(self, plant: LinearPlant, model: PaperModel | None = None) -> float:
@@ -76,9 +58,6 @@ class FeasibilityScan:
         return best
 
     def _ranked(self, model: PaperModel) -> list[Feasibility]:
-        """Returns all points of the scan in order of falling ratio."""
-        if not self._points:
-            raise LookupError("(C1) has no solution at any (kappa, rho)")
         points = []
         for kappa, rho, eigenvalue in self._points:
             alpha = model.at(kappa, rho).alpha
@@ -89,8 +68,7 @@ class FeasibilityScan:
 def _scanned(problem: OptimizationProblem) -> tuple[tuple[float, float, float], ...]:
     """Returns the points (kappa, rho) at which (C1) has a solution, each with its largest lambda_min(L).
 
-    A smaller rho only restricts L further ((C7) is the one constraint with rho in it, the error being left out), so the
-    scan of a kappa goes from its largest rho downwards and ends where there is no solution any more.
+    A smaller rho only restricts L further, so the scan of a kappa goes down from its largest rho until there is none.
     """
     points = []
     for kappa in _KAPPAS.tolist():

@@ -42,8 +42,8 @@ class OptimizationProblem:
     """OP of one plant, for any bounds on its uncertainty.
 
     It is solved in units in which the safe box is of size 1 and every input is limited by 1. All states share one unit,
-    so that OP's identity matrices stay what they are: with x = size x', L = size^2 L', and alpha and eps_up are divided
-    by size^2. The auxiliary matrix U is printed in units of alpha^2 / eps_up.
+    so that OP's identity matrices stay: with x = size x', L = size^2 L', and alpha and eps_up are divided by size^2.
+    The auxiliary matrix U is printed in units of alpha^2 / eps_up.
 
     Args:
         plant: The plant with a bounded safe box; its uncertainty is not used.
@@ -87,15 +87,13 @@ class OptimizationProblem:
     def largest_eigenvalue(self, bounds: PaperBounds, *, with_error: bool = True) -> float:
         """Returns the largest lambda_min(L) under all constraints but (C2): OP is feasible exactly if it reaches alpha.
 
-        The best beta of (C7) is lambda_min(L) itself, so beta is what is maximized.
+        Minus infinity if none exceeds the solver's inaccuracy. The best beta of (C7) is lambda_min(L), so beta is
+        maximized.
 
         Args:
             bounds: kappa, rho and the constants of OP at them.
             with_error: False drops the communication error from the input limit, which leaves
                 K_i L K_i' <= u_max^2 / 2 and makes the value independent of gamma, Q and P0.
-
-        Returns:
-            The eigenvalue [square of the states' unit]; minus infinity if none exceeds the solver's inaccuracy.
         """
         self._set(bounds, slack=0.0, with_error=with_error)
         _, largest, _ = self._at(bounds.rho)

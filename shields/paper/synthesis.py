@@ -1,4 +1,4 @@
-"""Algorithm 1 of Liu et al. and the certificate that it gives, or the reason why there is none."""
+"""Algorithm 1 of Liu et al. and the certificate that it gives."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from ncs_gym.validation import as_number
 from shields.errors import Infeasible
 from shields.paper.bounds import SMALLEST_GAP, PaperModel, unknown_bounds
 from shields.paper.certificate import PaperCertificate, verify
-from shields.paper.feasibility import FeasibilityScan, largest_scale
 from shields.paper.optimization_problem import OPSolution, OptimizationProblem
 
 # Relative tightening of every constraint, so that what the solver returns meets the printed ones in exact arithmetic.
@@ -57,7 +56,11 @@ def synthesize(plant: LinearPlant, *, dkappa: float = 0.02, drho: float = 0.05) 
         )
         if verify(certificate, plant).valid:
             return certificate
-    raise _diagnosis(plant)
+    raise Infeasible(
+        "OP has no solution on this grid that meets (C1)-(C7): take smaller steps dkappa and drho, or smaller bounds",
+        "OP",
+        1.0,
+    )
 
 
 def grid_solutions(plant: LinearPlant, dkappa: float = 0.02, drho: float = 0.05) -> Iterator[OPSolution]:
@@ -93,36 +96,3 @@ def kappa_rho_grid(dkappa: float, drho: float) -> Iterator[tuple[float, float]]:
             rho = 1.0 + j * drho
         i += 1
         kappa = 1.0 - i * dkappa
-
-
-def _diagnosis(plant: LinearPlant) -> Infeasible:
-    """Returns the exception that says which constraint binds, by how much, and what would be feasible."""
-    scan = FeasibilityScan(plant)
-    try:
-        best = scan.best(plant)
-    except LookupError as error:
-        return Infeasible(f"OP is infeasible: {error}", "C1", np.inf)
-    full = scan.full_ratio(plant) if best.ratio >= 1.0 else best.ratio
-    if best.ratio >= 1.0 > full:
-        return Infeasible(
-            f"OP is infeasible, the input limit with the communication error (C4)-(C6) binds: with it the largest "
-            f"lambda_min(L)/alpha found is {full:.3g} (without it {best.ratio:.3g}) and must be at least 1",
-            "C5",
-            1.0 - full,
-        )
-    if full >= 1.0:
-        return Infeasible(
-            f"OP has no solution on this grid, but has one near kappa = {best.kappa:.3f}, rho = {best.rho:.3f}: use "
-            "smaller steps dkappa and drho",
-            "grid",
-            0.0,
-        )
-    scale = largest_scale(scan, plant)
-    return Infeasible(
-        f"OP is infeasible, (C2) binds: over the whole domain the largest lambda_min(L)/alpha is {best.ratio:.3g} (at "
-        f"kappa = {best.kappa:.3f}, rho = {best.rho:.3f}) and must be at least 1; it is feasible with "
-        f"gamma, Q and P0 all scaled by {scale:.3g}",
-        "C2",
-        1.0 - best.ratio,
-        {"ratio": best.ratio, "kappa": best.kappa, "rho": best.rho, "largest_scale": scale},
-    )

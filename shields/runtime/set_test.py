@@ -199,7 +199,7 @@ class SetTest:
             form = (float(pushed.dot(pushed)), float(pushed.dot(offset)), float(offset.dot(offset)))
             u = closest_on_line(u, *form, errors.radius - rounding - margin, self.limits[0][1])
         if len(self.disturbed):
-            ((middle, half),) = self.plant.input_scales
+            middle, half = self.plant.input_middle.item(), self.plant.input_half.item()
             offset = [*(center[self.cone :] - self.middle).tolist(), -middle]
             limits = [*(errors.row_limits - rounding - margin).tolist(), half]
             u = closest_in_interval(u, offset, self._limited_rows[:, 0].tolist(), limits)

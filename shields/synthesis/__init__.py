@@ -3,17 +3,15 @@
 `certification` reads as one page: gains and what they bear (`tolerance`), at which the largest ellipsoid begins
 (`ellipsoid_certificates`: alternation between linear matrix inequalities and multipliers), else a polytope alone
 (`polytope_certificates`); each is verified exactly, and where there is none `diagnosis` says why. `design_problem` is
-the plant in scaled coordinates. `certify` proves a given set and gain, and `requirements` says which contracts leave a
-plant certifiable. Importing this package imports the solver.
+the plant in scaled coordinates; `requirements` says which contracts leave a plant certifiable. Importing this package
+imports the solver.
 """
 
 from shields.synthesis.certification import synthesize
-from shields.synthesis.ellipsoid_certificates import certify
 from shields.synthesis.network_requirements import Requirements, requirements
 
 __all__ = [
     "Requirements",
-    "certify",
     "requirements",
     "synthesize",
 ]

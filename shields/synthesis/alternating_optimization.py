@@ -13,7 +13,7 @@ from shields.synthesis.multipliers import best_input_multipliers, best_multiplie
 from shields.synthesis.tolerance import SUFFICIENT_MARGIN, invariant_ellipsoid
 
 # Some plants still gain 1 % of volume per alternation after ten of them.
-ALTERNATIONS = 40
+_ALTERNATIONS = 40
 # An alternation that gains less than this in log det, 1 % of volume, is the last one with its step.
 _SMALLEST_GAIN = 0.02
 # Relative steps of the pattern search over the multipliers.
@@ -32,31 +32,26 @@ def largest_set(
     slack: float,
     report: ProgressCallback,
     gains: Sequence[np.ndarray],
-    start: CandidateDesign | None = None,
-    alternations: int = ALTERNATIONS,
 ) -> CandidateDesign | None:
     """Returns the design of largest volume that alternation finds; None if no initial design is found.
 
     Args:
         problem: The scaled design problem.
         slack: Relative tightening of the conditions.
-        report: Called with the stage and the best design so far, at the initial design and per alternation.
+        report: Called with the stage and the best design so far.
         gains: Gains in physical units, shape (m, n), of which one has the initial design.
-        start: Design of a similar problem, which alternation begins near if it can; None for none.
-        alternations: Largest number of them.
     """
     program = InvariantSetProgram(problem, slack)
-    best = None if start is None else program.solve(start.multipliers, start.inputs, start.L)
-    best = best or initial_design(problem, program, gains)
+    best = initial_design(problem, program, gains)
     if best is None:
         return None
     report("initial design", best)
     steps = list(_STEPS)
-    for turn in range(alternations):
+    for turn in range(_ALTERNATIONS):
         if -best.log_det < _VOLUME_TOLERANCE or not steps:
             break
         better = _alternate(problem, program, best, steps[0])
-        report(f"alternation {turn + 1} of at most {alternations}", better)
+        report(f"alternation {turn + 1} of at most {_ALTERNATIONS}", better)
         if better.log_det - best.log_det < _SMALLEST_GAIN:
             steps.pop(0)
         best = better
@@ -121,5 +116,4 @@ def with_best_gain(problem: DesignProblem, design: CandidateDesign) -> Candidate
 
 
 def _larger(best: CandidateDesign, other: CandidateDesign | None) -> CandidateDesign:
-    """Returns the design with the larger set."""
     return other if other is not None and other.log_det > best.log_det else best

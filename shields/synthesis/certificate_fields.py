@@ -56,7 +56,6 @@ def proofs_of(
 
 
 def _updates(errors: ErrorSet) -> Updates | None:
-    """Returns what a channel contract adds to the proofs; None without one."""
     if errors.contract is None:
         return None
     return Updates(
@@ -93,16 +92,8 @@ def provenance_of(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
 def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, float]:
     """Returns the record of the share of the safe box's volume that E(L) fills: pi/4 of a plane's at most.
 
-    Where the last states are inputs under way (`Model.with_delays`) the box is that of the others, and what counts is
-    which of its states are in E(L) with no input under way.
-
-    Args:
-        plant: The plant, with its safe box.
-        L: Shape of a set in the box, (n, n).
-
-    Returns:
-        One entry, `share_of_box` or `share_of_box_at_rest`, a number in (0, 1]; none of flat sets, and of boxes that
-        are open or have more rows than states.
+    With delayed inputs it is `share_of_box_at_rest`, that of the other states with no input under way. There is none of
+    flat sets, and of boxes that are open or have more rows than states.
     """
     kept = plant.n - plant.past
     C = plant.box[plant.box[:, :kept].any(axis=1)] if plant.past else plant.box
@@ -123,10 +114,7 @@ def reach_recorded(safe_set: Ellipsoid | Polytope, plant: LinearPlant) -> dict[s
 
 
 def _volume_of(plant: LinearPlant, L: np.ndarray) -> float:
-    """Returns the volume of an ellipsoid in units of the largest one in the safe box; NaN where that is not known.
-
-    It is where the box has a center, a point in the middle between all of its pairs of ends.
-    """
+    """Returns the volume of an ellipsoid in units of the largest one in the box; NaN if the box has no center."""
     middle, half = 0.5 * plant.box_ends.sum(axis=0), 0.5 * np.ptp(plant.box_ends, axis=0)
     if not np.isfinite(half).all() or exact.rank(plant.box) < plant.n:
         return math.nan

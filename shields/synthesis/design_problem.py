@@ -17,8 +17,7 @@ from shields.errors import Infeasible
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.verification import ACTION_ROUNDING
 
-# The certificate's Sigma and D are larger than the environment's by this factor, so that another machine's rounding (of
-# a Lyapunov solution, of a chi-square quantile) stays inside.
+# The certificate's Sigma is larger than the environment's by this factor: another machine's rounding stays inside.
 INFLATION = 1.0 + 1e-9
 # Axes of an error set are lengthened to at least this fraction of its longest one in the semidefinite programs; exact
 # verification uses the error set itself.
@@ -61,9 +60,9 @@ class DesignProblem:
         A: State matrix in scaled coordinates, shape (n, n).
         B: Input matrix in scaled coordinates, shape (n, m).
         C: Rows of the safe box in scaled coordinates, shape (k, n).
-        D_u: Shape of the disturbance set with the rounding of actions (docs/shield_proof.md), scaled, (n, n).
+        D_u: Shape of the disturbance set with the rounding of actions, scaled, (n, n).
         error_shapes: Shapes of the error sets for which K x_hat must be safe, scaled, (k, n, n).
-        transform: The transformation T, shape (n, n).
+        transform: T, shape (n, n).
         u_max: Input limits in physical units, shape (m,).
         rounding: Multiplier s of D_u.
     """
@@ -78,21 +77,10 @@ class DesignProblem:
     rounding: float
 
     @property
-    def n(self) -> int:
-        """Number of states."""
-        return self.A.shape[0]
-
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return self.B.shape[1]
-
-    @property
     def maximal_error_shapes(self) -> np.ndarray:
-        """The error sets that lie in no other one, thickened where they are nearly flat, shape (l, n, n).
+        """The error sets that lie in no other one, shape (l, n, n), thickened where they are nearly flat.
 
-        The linearization of L Sigma^-1 L allows hardly any change of L if Sigma is nearly flat. A larger error set is
-        sound.
+        A larger set is sound; for a flat one the linearization of L Sigma^-1 L allows hardly any change of L.
         """
         kept = list(self.error_shapes)
         for Sigma in self.error_shapes:
@@ -100,7 +88,7 @@ class DesignProblem:
             if any(is_inside(Sigma, other) for other in others):
                 kept = others
         longest = np.linalg.eigvalsh(np.stack(kept))[:, -1]
-        return np.stack(kept) + _SMALLEST_AXIS_RATIO**2 * longest[:, None, None] * np.eye(self.n)
+        return np.stack(kept) + _SMALLEST_AXIS_RATIO**2 * longest[:, None, None] * np.eye(len(self.A))
 
     @cached_property
     def covering_error_shape(self) -> np.ndarray:
@@ -111,11 +99,6 @@ class DesignProblem:
         """Returns L (n, n) and K (m, n) in physical units."""
         shape = self.transform @ L @ self.transform.T
         return 0.5 * (shape + shape.T), np.diag(self.u_max) @ np.linalg.solve(self.transform.T, K.T).T
-
-    def to_scaled(self, L: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns L (n, n) and K (m, n) in scaled coordinates."""
-        inverse = np.linalg.inv(self.transform)
-        return inverse @ L @ inverse.T, (K @ self.transform) / self.u_max[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +119,7 @@ class CandidateDesign:
 
     @cached_property
     def log_det(self) -> float:
-        """Logarithm of det L; 0 is the largest ellipsoid in the safe box."""
+        """log det L; 0 is the largest ellipsoid in the safe box."""
         return float(np.linalg.slogdet(self.L)[1])
 
 
@@ -145,24 +128,12 @@ def design_problem(
 ) -> tuple[DesignProblem, ErrorSet]:
     """Returns the scaled design problem, and the error set with its shapes a little larger than the environment's.
 
-    Args:
-        plant: The plant.
-        contract: Channel contract, if there is one.
-        limits: Limits inside the plant's within which the set is sought; the plant's own by default.
+    The set is sought within `limits`, by default the plant's own.
 
     Raises:
-        Infeasible: If the plant has no error set, its safe box is unbounded, or far too wide for times between samples.
+        Infeasible: If the plant has no error set, or its safe box is flat, or far too wide for times between samples.
     """
     limits = SymmetricLimits(plant.box_rows, plant.u_max) if limits is None else limits
-    free = plant.n - exact.rank(limits.box_rows)
-    if free:
-        without = [name for name, column in zip(plant.state_names, limits.box_rows.T, strict=True) if not column.any()]
-        among = f" (of {', '.join(without)})" if without else ""
-        raise Infeasible(
-            f"the safe box leaves {free} of {plant.n} directions unbounded{among}: give generous Limits of these",
-            "S",
-            free,
-        )
     _, sizes, directions = np.linalg.svd(limits.box_rows * plant.half_widths)
     flatness = float(sizes[0] / sizes[-1])
     if flatness > _FLATTEST:
@@ -191,11 +162,6 @@ def design_problem(
         ) from error
     except ErrorSetError as error:
         raise Infeasible(str(error), "E1", 0.0) from error
-    return _scaled(plant, errors.promised, limits), errors
-
-
-def _scaled(plant: LinearPlant, error_shapes: np.ndarray, limits: SymmetricLimits) -> DesignProblem:
-    """Returns the design problem for error sets (k, n, n), in the largest ellipsoid within the limits."""
     box_rows, u_max = limits
     box = largest_box_ellipsoid(box_rows)
     T = np.linalg.cholesky(box)
@@ -207,29 +173,23 @@ def _scaled(plant: LinearPlant, error_shapes: np.ndarray, limits: SymmetricLimit
     s = float(exact.rounded(np.sqrt(np.clip(ratio, 1e-16, 1.0)), 6))
     inverse = np.linalg.inv(T)
     D_u = (1.0 + s) * D + (1.0 + 1.0 / s) * rounding
-    return DesignProblem(
+    problem = DesignProblem(
         A=inverse @ plant.A @ T,
         B=inverse @ plant.B @ np.diag(u_max),
         C=box_rows @ T,
         D_u=inverse @ D_u @ inverse.T,
-        error_shapes=inverse @ error_shapes @ inverse.T,
+        error_shapes=inverse @ errors.promised @ inverse.T,
         transform=T,
         u_max=u_max,
         rounding=s,
     )
+    return problem, errors
 
 
 def taken_between_samples(plant: LinearPlant, grid: GridRows, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns what is not left of the rows of the box at the times of a plant's grid, and what disturbances take.
+    """Returns what is not left of the box between samples (docs/shield_proof.md, "Between the samples").
 
-    Args:
-        plant: The plant.
-        grid: Its rows between samples.
-        D: Shape of the disturbance set, (n, n).
-
-    Returns:
-        eta and the rounding of actions, shape (N, k), and the supports rho of the disturbance, (k,)
-        (docs/shield_proof.md, "Between the samples").
+    That is eta and the rounding of actions, shape (N, k), and the supports rho of the disturbance E(D), (k,).
     """
     rounding = float(ACTION_ROUNDING) * (np.abs(grid.input) @ plant.input_half)
     squares = np.einsum("ji,ik,jk->j", plant.box, D, plant.box)

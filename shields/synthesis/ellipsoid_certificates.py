@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,12 +12,12 @@ from ncs_gym import LinearPlant
 from ncs_gym.network.contract import ChannelContract
 from shields.certificate import Certificate
 from shields.errors import Infeasible
-from shields.synthesis.alternating_optimization import ALTERNATIONS, largest_set, with_best_gain
+from shields.synthesis.alternating_optimization import largest_set, with_best_gain
 from shields.synthesis.certificate_fields import certificate_of
-from shields.synthesis.design_problem import CandidateDesign, DesignProblem, SymmetricLimits, design_problem
+from shields.synthesis.design_problem import CandidateDesign, SymmetricLimits, design_problem
 from shields.synthesis.invariant_polytope import feedback_of, limits_within_step
-from shields.synthesis.multipliers import with_best_multipliers
 from shields.synthesis.search import Search
+from shields.synthesis.tolerance import Tolerated
 from shields.verification import Report, verify
 
 # Relative tightening of the semidefinite programs, so that the result verifies exactly.
@@ -33,49 +32,15 @@ MORE_DIGITS = (
 _BETWEEN_MARGIN, _MOST_BOXES = 1e-3, 8
 # Where no set is found, half-widths of the box that differ by more are named as the reason.
 _WIDEST_SPREAD = 1e6
-# Multipliers from which those of a given set and gain are sought.
-_INITIAL_MULTIPLIERS = (0.9, 0.03, 0.07)
-
-
-def certify(
-    plant: LinearPlant, L: np.ndarray, K: np.ndarray, contract: ChannelContract | None = None
-) -> Certificate | None:
-    """Returns a verified certificate for a given set and gain; None if no multipliers that prove it are found.
-
-    Args:
-        plant: The plant with its bounds.
-        L: Shape of the safe set, (n, n).
-        K: Gain, shape (m, n) [input per state].
-        contract: Channel contract; with one, the error sets depend on the age of the newest sample.
-
-    Raises:
-        Infeasible: If the plant has no error set or its safe box is unbounded.
-    """
-    problem, errors = design_problem(plant, contract)
-    design = _design_at(problem, L, K, _INITIAL_MULTIPLIERS)
-    certificate = replace(certificate_of(plant, problem, design, errors), L=L, K=K)
-    return certificate if verify(certificate, plant).valid else None
 
 
 def largest_ellipsoid(
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    gains: Sequence[np.ndarray],
-    search: Search,
-    start: Certificate | None = None,
-    alternations: int = ALTERNATIONS,
+    plant: LinearPlant, contract: ChannelContract | None, gains: Sequence[Tolerated], search: Search
 ) -> Certificate | None:
     """Returns the largest set that alternation finds, verified; None where no set is found for no known reason.
 
-    Where the set leaves the box between samples, one is sought in a box that is smaller by that.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract, if there is one.
-        gains: Gains, shape (m, n), one of which the search begins at.
-        search: Is told the stages, and holds the best candidate.
-        start: Certificate of a similar problem with as many states and inputs, which the search begins near.
-        alternations: Largest number of them.
+    It begins at one of the gains. Where the set leaves the box between samples, one is sought in a box that is smaller
+    by that.
 
     Raises:
         Infeasible: If the plant has no design problem, or there is no certificate for a known reason.
@@ -83,7 +48,7 @@ def largest_ellipsoid(
     box_rows = plant.box_rows
     for _ in range(_MOST_BOXES):
         limits = SymmetricLimits(box_rows, plant.u_max)
-        candidate = _candidate(plant, contract, limits, gains, search, start, alternations)
+        candidate = _candidate(plant, contract, limits, gains, search)
         over = None if candidate is None else _over_between_samples(candidate, plant)
         if over is None or over.max() <= 1.0:
             break
@@ -94,7 +59,7 @@ def largest_ellipsoid(
         report = verify(candidate, plant)
         if report.valid:
             return candidate
-        raise _failed_verification(report)
+        raise failed_verification(report)
     if (widest := float(np.abs(box_rows).max() / np.abs(plant.box_rows).max())) > 1.0:
         raise _leaves_between_samples(widest - 1.0)  # there is a set in the plant's own box
     if (spread := float(plant.half_widths.max() / plant.half_widths.min())) > _WIDEST_SPREAD:
@@ -107,18 +72,12 @@ def _candidate(
     plant: LinearPlant,
     contract: ChannelContract | None,
     limits: SymmetricLimits,
-    gains: Sequence[np.ndarray],
+    gains: Sequence[Tolerated],
     search: Search,
-    start: Certificate | None,
-    alternations: int,
 ) -> Certificate | None:
     """Returns the certificate of the largest set within limits, not yet verified; None if no set is found."""
     search("error set")
     problem, errors = design_problem(plant, contract, limits)
-    near = None
-    if start is not None and (shares := start.proofs[-1].shares) is not None:
-        lx, le, ld = shares.tolist()
-        near = _design_at(problem, start.L, start.K, (lx, le, ld))
 
     def certificate(design: CandidateDesign) -> Certificate:
         return certificate_of(plant, problem, with_best_gain(problem, design), errors)
@@ -127,19 +86,11 @@ def _candidate(
         search.candidate = partial(certificate, design)
         search(f"{stage}: {math.exp(0.5 * design.log_det):.4f} of the box ellipsoid's volume")
 
-    found = largest_set(problem, _SLACK, report, gains, near, alternations)
+    found = largest_set(problem, _SLACK, report, [each.K for each in gains])
     if found is None:
         return None
     report("exact verification", found)
     return certificate(found)
-
-
-def _design_at(
-    problem: DesignProblem, L: np.ndarray, K: np.ndarray, multipliers: tuple[float, float, float]
-) -> CandidateDesign:
-    """Returns a set and gain in physical units as a design, with the best multipliers near given ones."""
-    given = CandidateDesign(*problem.to_scaled(L, K), multipliers, np.empty(0))
-    return with_best_multipliers(problem, given, problem.error_shapes)
 
 
 def _over_between_samples(certificate: Certificate, plant: LinearPlant) -> np.ndarray:
@@ -153,14 +104,13 @@ def _over_between_samples(certificate: Certificate, plant: LinearPlant) -> np.nd
         return np.ones(len(plant.box_rows))
     if grid.high.min() <= 0.0:
         raise _leaves_between_samples(1.0)
-    reach = np.sqrt(((grid.images @ certificate.L) * grid.images).sum(axis=1)) / grid.high
+    reach = np.sqrt(((grid.rows @ certificate.L) * grid.rows).sum(axis=1)) / grid.high
     over = reach.reshape(-1, len(plant.box_rows)).max(axis=0)
     left = over.max() > 1.0 - 0.1 * _BETWEEN_MARGIN
     return np.maximum(over / (1.0 - _BETWEEN_MARGIN), 1.0) if left else np.ones(len(over))
 
 
 def _leaves_between_samples(shortfall: float) -> Infeasible:
-    """Returns the exception for sets that hold at the sampling instants alone."""
     return Infeasible(
         "(B) the state leaves the box between two samples: a shorter dt, more grid points (between_samples=) or less "
         "disturbance would help, and between_samples=1 asks for the sampling instants alone",
@@ -169,7 +119,7 @@ def _leaves_between_samples(shortfall: float) -> Infeasible:
     )
 
 
-def _failed_verification(report: Report) -> Infeasible:
+def failed_verification(report: Report) -> Infeasible:
     """Returns the exception for a candidate that does not verify."""
     failed = next(condition for condition in report.conditions if not condition.holds)
     return Infeasible(

@@ -64,15 +64,10 @@ class Extremes:
     """The least and the largest values that rows take in a polytope.
 
     Each is a linear program, in which HiGHS (Huangfu and Hall 2018, docs/bibliography.md) goes on from the solution of
-    the one before.
+    the one before. Numbers out of its reach raise ArithmeticError.
     """
 
     def __init__(self, faces: Faces) -> None:
-        """Begins with faces.
-
-        Raises:
-            ArithmeticError: If their numbers are out of the solver's reach.
-        """
         self._faces, self._n = Faces(*(part.copy() for part in faces)), faces.rows.shape[1]
         self._columns = np.arange(self._n, dtype=np.int32)
         self._solver = _SilentHighs()
@@ -88,11 +83,7 @@ class Extremes:
         return self._faces
 
     def add(self, faces: Faces) -> None:
-        """Adds faces.
-
-        Raises:
-            ArithmeticError: If their numbers are out of the solver's reach.
-        """
+        """Adds faces."""
         self._faces = self._faces.followed_by(faces)
         self._add(faces)
 
@@ -108,13 +99,7 @@ class Extremes:
         self._solver.addRows(len(rows), faces.low, faces.high, rows.size, starts, columns, rows.ravel())
 
     def of(self, row: np.ndarray) -> tuple[float, float]:
-        """Returns the least and the largest row z, shape (n,), infinite where there is none.
-
-        Of a symmetric polytope they are each other's.
-
-        Raises:
-            ArithmeticError: If the row's numbers are out of the solver's reach.
-        """
+        """Returns the least and the largest row z, shape (n,), infinite where there is none."""
         largest = self._largest(row)
         return -largest if self._faces.are_symmetric else -self._largest(-row), largest
 
@@ -124,7 +109,7 @@ class Extremes:
         For any multipliers l, row z = l G z + (row - l G) z.
 
         Args:
-            row: Its numbers should be about 1, since the solver's tolerances are absolute.
+            row: Of numbers about 1, since the solver's tolerances are absolute.
             reach: Bounds of |z|, shape (n,).
         """
         above = self._bound(row, reach)

@@ -1,14 +1,14 @@
 """The largest polytope that the certified gain keeps in the safe box (docs/shield_proof.md, "Polytopes").
 
-It begins with the rows of the box and of the input limits. For every row g with |g x| <= 1, the states after one step
-fulfil it if |g (A+BK) x| <= 1 - s - d, where s and d are the supports of the estimation error and of the disturbance:
-that is a row again. What a linear program shows to hold already is not added. A+BK is stable, so this comes to an end.
+It begins with the rows of the box and of the input limits. The next state fulfils a row, |g x| <= 1, if |g (A+BK) x|
+<= 1 - s - d, where s and d are the supports of the estimation error and of the disturbance: that is a row again. What a
+linear program shows to hold already is not added. A+BK is stable, so this comes to an end.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,13 +18,13 @@ from ncs_gym import LinearPlant, exact
 from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.polytope import MOST_ROWS, Polytope
-from shields.synthesis.design_problem import Rest, taken_between_samples
+from shields.synthesis.design_problem import Rest
 from shields.synthesis.faces import OPEN, Extremes, Faces, multipliers_of
-from shields.synthesis.resting_point import units_of_states
+from shields.synthesis.resting_point import around, limit_rows, units_of_states
 from shields.verification import ACTION_ROUNDING
 
 # The search follows at most so many rows from one step to the one before, nearly five times what it takes for any
-# published plant that has a polytope. They are counted, not timed: the speed of a machine decides no certificate.
+# published plant that has a polytope.
 MOST_FOLLOWED = 2000
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
 # and for what others imply only up to some part of it. Where one makes too many rows, a larger one makes fewer; the
@@ -51,9 +51,9 @@ class Feedback(NamedTuple):
 
     Attributes:
         K: The gain, shape (m, n).
-        errors: Shapes of the sets of the estimation error, (l, n, n).
+        errors: Shapes of the error sets, (l, n, n).
         D: Shape of the disturbance set, (n, n).
-        rest: x_c and u_c, shapes (n,) and (m,).
+        rest: x_c and u_c.
     """
 
     K: np.ndarray
@@ -81,49 +81,35 @@ def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces
     return Faces(rows / half[:, None], low / half, high / half)
 
 
-def invariant_polytopes(
-    feedback: Feedback, plant: LinearPlant, progress: Callable[[str], object]
-) -> Iterator[Polytope]:
-    """Yields the largest polytopes that a fallback keeps invariant, not yet verified, with one margin after the other.
+def invariant_polytope(
+    feedback: Feedback, plant: LinearPlant, margin: float, progress: Callable[[str], object] = lambda line: None
+) -> Polytope:
+    """Returns the largest polytope that a fallback keeps invariant, not yet verified.
 
-    Args:
-        feedback: The fallback.
-        plant: Its plant.
-        progress: Called with a line of text now and then.
+    A state along which it would have no end gets the limit within which its gain was sought. From the margin, one of
+    `MARGINS`, follows how much a row must cut.
 
     Raises:
         Infeasible: If there is none within `MOST_ROWS` rows, `MOST_FOLLOWED` of them followed; the message says why.
     """
-    failure: Infeasible | None = None
-    for margin in MARGINS:
-        implied = _IMPLIED if margin == MARGINS[0] else _NEARLY_IMPLIED * margin
-        try:
-            yield _polytope_of(_ClosedLoop(feedback, plant, margin), progress, implied)
-        except Infeasible as infeasible:
-            if infeasible.binding == "R":
-                failure = infeasible
-                progress(f"polytope: {failure}")
-                continue
-            failure = failure or infeasible
-            if margin == min(MARGINS):  # a larger one leaves less
-                break
-    if failure is not None:
-        raise failure
-
-
-def _polytope_of(step: _ClosedLoop, progress: Callable[[str], object], implied: float) -> Polytope:
-    """Returns a polytope of `invariant_polytopes`, of rows that cut by more than `implied`.
-
-    A state along which it would have no end gets the limit within which its gain was sought.
-    """
-    kept = len(step.plant.box)
+    step, kept = _ClosedLoop(feedback, plant, margin), len(plant.box)
+    implied = _IMPLIED if margin == MARGINS[0] else _NEARLY_IMPLIED * margin
     faces = invariant_faces(step.first_faces(), step.predecessor, kept, progress, implied)
-    extents = _extents(faces) if step.has_free_states else np.ones(step.plant.n)
+    extents = _extents(faces) if step.has_free_states else np.ones(plant.n)
     if (np.abs(np.log10(extents)) > _SIMILAR).any():  # how far states go is known now
         step.limited = np.isinf(extents)
         step.widths = step.widths * np.where(step.limited, 1.0, extents)
         faces = invariant_faces(step.first_faces(), step.predecessor, kept, progress, implied)
-    return _rounded(step, faces)
+    physical = step.in_physical_units(faces)
+    upper, lower = step.multipliers(physical)
+    return Polytope(
+        rows=physical.rows,
+        low=physical.low,
+        high=physical.high,
+        center=step.rest.state,
+        multipliers=upper,
+        lower_multipliers=lower,
+    )
 
 
 def invariant_faces(
@@ -143,8 +129,7 @@ def invariant_faces(
         implied: A row is added if it cuts off more than that.
 
     Raises:
-        Infeasible: If there are none within `MOST_ROWS` rows and `MOST_FOLLOWED` that are followed, or `predecessor`
-            raises it.
+        Infeasible: If there are none within `MOST_ROWS` and `MOST_FOLLOWED`, or `predecessor` raises it.
     """
     if kept > MOST_ROWS:
         raise _none(
@@ -186,40 +171,21 @@ def invariant_faces(
 def share_in_polytope(polytope: Polytope, plant: LinearPlant) -> float | None:
     """Returns the share of the safe box's volume that a polytope fills, to about three digits.
 
-    None where a state has no limits of its own; where the last states are past inputs
-    of the others, with past inputs at the operating one.
+    Past inputs are the operating one. None where a state has no limits of its own.
     """
-    points, past = points_of_box(plant, _POINTS_LOG2), plant.past
-    if points is not None:
-        points[:, plant.n - past :] = 0.0
-        return float((polytope.gauge(points) <= 1.0).mean())
     low, high = plant.own_limits  # of the box that these make, further limits leave a part
     if not np.isfinite(plant.own_limits).all():
         return None
     points = low + (high - low) * qmc.Sobol(plant.n, scramble=False).random_base2(_POINTS_LOG2)
-    points[:, plant.n - past :] = 0.0
+    points[:, plant.n - plant.past :] = 0.0
     points = points[(plant.constraint_values(points.T) <= 0.0).all(axis=0)]
     return float((polytope.gauge(points) <= 1.0).mean()) if len(points) >= _LEAST_POINTS else None
 
 
-def share_of_last_input(polytope: Polytope, plant: LinearPlant) -> float | None:
-    """Returns what part of its range the last input has in a polytope, the least one of several inputs.
-
-    None where the last states are no past inputs.
-    """
-    if not plant.past:
-        return None
-    m, axes = plant.m, np.eye(plant.n)[-plant.m :]
-    ends = polytope.support(np.concatenate([axes, -axes]))
-    least, most = np.maximum(-ends[m:], plant.input_ends[0]), np.minimum(ends[:m], plant.input_ends[1])
-    return float(((most - least) / np.ptp(plant.input_ends, axis=0)).min())
-
-
 def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
-    """Returns 2^log2 points that fill the safe box evenly, shape (2^log2, n).
+    """Returns 2^log2 points that fill the safe box evenly, (2^log2, n), past inputs within the limits of inputs.
 
-    None where the box is no product of intervals. Past inputs are within their limits, not in the wider rows that the
-    box has for them.
+    None where the box is no product of intervals.
     """
     rows, past = plant.box, plant.past
     is_product = rows.shape == (plant.n, plant.n) and np.count_nonzero(rows) == plant.n and rows.any(axis=0).all()
@@ -236,13 +202,8 @@ def points_of_box(plant: LinearPlant, log2: int) -> np.ndarray | None:
 def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) -> float:
     """Returns what share of points of the safe box a fallback keeps in it for ever.
 
-    They are those of the polytope of `invariant_polytopes`, found without linear programs, and without the limit of
-    rows. 0.0 where there is no such polytope, or `_MOST_STEPS` steps do not tell.
-
-    Args:
-        feedback: The fallback.
-        plant: Its plant.
-        points: Of the box, shape (count, n).
+    They are those of the polytope of `invariant_polytope`, found without linear programs, and without the limit of
+    rows. 0.0 where there is no such polytope, or `_MOST_STEPS` steps do not tell. Points are of shape (count, n).
     """
     step, total = _ClosedLoop(feedback, plant, MARGINS[0]), len(points)
     if np.abs(np.linalg.eigvals(step.next)).max() >= 1.0:
@@ -265,42 +226,20 @@ def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) 
     return 0.0
 
 
-class LimitsInClosedLoop(NamedTuple):
-    """What limits within a step ask of x - x_c under the fallback: first the box at the times of a plant's grid.
+def limits_within_step(feedback: Feedback, plant: LinearPlant) -> Faces:
+    """Returns what limits within a step ask of x - x_c under the fallback, for all errors and disturbances.
 
-    Those are ordered by time, then by box row; limits of states and inputs together follow.
-
-    Attributes:
-        images: c (A_tau + B_tau K), and f + g K of the others, shape (g, n).
-        low, high: Between what image (x - x_c) may be so that the limit holds for all errors and disturbances, for the
-            box less eta, shape (g,).
+    First the box less eta at the times of the plant's grid, ordered by time, then by row (docs/shield_proof.md,
+    "Between the samples"); then limits of states and inputs together (the same, "States and inputs together").
     """
-
-    images: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-
-def limits_within_step(feedback: Feedback, plant: LinearPlant) -> LimitsInClosedLoop:
-    """Returns the rows of docs/shield_proof.md, "Between the samples" and "States and inputs together"."""
-    (K, errors, D, rest), n = feedback, plant.n
-    state, pushed = plant.mixed_rows[:, :n], plant.mixed_rows[:, n:]
-    (low, high), taken = plant.mixed_ends, float(ACTION_ROUNDING) * (np.abs(pushed) @ plant.input_half)
-    if plant.grid_rows is not None:
-        on_grid, pushed_on_grid, _ = plant.grid_rows
-        of_grid, disturbed = taken_between_samples(plant, plant.grid_rows, D)
-        points = len(on_grid)
-        state = np.concatenate([on_grid.reshape(-1, n), state])
-        pushed = np.concatenate([pushed_on_grid.reshape(-1, plant.m), pushed])
-        taken = np.concatenate([(of_grid + disturbed).ravel(), taken])
-        low, high = (
-            np.concatenate([np.tile(of_box, points), mixed])
-            for of_box, mixed in zip(plant.box_ends, (low, high), strict=True)
-        )
-    answer = pushed @ K
+    (K, errors, D, rest), mixed = feedback, len(plant.mixed_rows)
+    limits = around(limit_rows(plant, D), rest)
+    order = np.roll(np.arange(len(plant.box) + plant.m, len(limits.rows)), -mixed)
+    state, pushed = np.split(limits.rows[order], [plant.n], axis=1)
+    answer, taken = pushed @ K, limits.disturbed[order]
+    taken[len(order) - mixed :] += float(ACTION_ROUNDING) * (np.abs(plant.mixed_rows[:, plant.n :]) @ plant.input_half)
     least = taken + np.sqrt(np.maximum(np.einsum("ri,lij,rj->lr", answer, errors, answer), 0.0).max(axis=0))
-    at_rest = state @ rest.state + pushed @ rest.input
-    return LimitsInClosedLoop(state + answer, low - at_rest + least, high - at_rest - least)
+    return Faces(state + answer, limits.low[order] + least, limits.high[order] - least)
 
 
 class _ClosedLoop:
@@ -317,8 +256,7 @@ class _ClosedLoop:
     def first_faces(self) -> Faces:
         """Returns the faces of the box, of input limits, of limits within a step, and of those of `limited` states.
 
-        Raises:
-            Infeasible: If errors of the estimate alone take an input beyond its limit, or the rest is not inside.
+        Raises Infeasible if errors and disturbances alone leave one.
         """
         plant, (x_c, u_c) = self.plant, self.rest
         reached = plant.box @ x_c
@@ -337,16 +275,12 @@ class _ClosedLoop:
                 "errors of the estimate alone break a limit of states and inputs together; better sensors, or a gain "
                 "that answers less, leave room"
             )
-        faces = box.followed_by(inputs).followed_by(in_half_ranges(within.images, low, high))
+        faces = box.followed_by(inputs).followed_by(in_half_ranges(within.rows, low, high))
         own, ones = np.eye(plant.n)[self.limited], np.ones(np.count_nonzero(self.limited))
         return faces._replace(rows=faces.rows * self.widths).followed_by(Faces(own, -ones, ones))
 
     def predecessor(self, faces: Faces) -> Faces:
-        """Returns what states have to fulfil so that the next ones fulfil rows.
-
-        Raises:
-            Infeasible: If errors and disturbances alone leave a row.
-        """
+        """Returns what states have to fulfil so that the next ones fulfil rows; raises Infeasible as `first_faces`."""
         physical = faces.rows / self.widths
         pushed = physical @ self.plant.B
         taken = self._margin + self._reach(pushed @ self._K) + np.sqrt(((physical @ self._D) * physical).sum(axis=-1))
@@ -359,10 +293,7 @@ class _ClosedLoop:
         return np.sqrt(np.maximum(squares, 0.0)).max(axis=0)
 
     def in_physical_units(self, faces: Faces) -> Faces:
-        """Returns faces in physical units, rounded, as the plant's state has them.
-
-        The rows of the box are those of the plant to the last bit, and so are their ends.
-        """
+        """Returns rounded faces of the plant's state; those of the box are the plant's to the last bit."""
         plant, count = self.plant, len(self.plant.box)
         rows = exact.rounded(faces.rows, _DIGITS, axis=1) / self.widths
         reached = rows @ self.rest.state
@@ -374,15 +305,12 @@ class _ClosedLoop:
         return own.followed_by(Faces(rows, low, high).some(slice(count, None)))
 
     def multipliers(self, faces: Faces) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what writes rows after one step, of the gain and within a step as sums of rows, (r + m + g, r) each.
-
-        The first bound them from above, the second from below.
-        """
+        """Returns what bounds next rows, the gain's, and those within a step from above and below, (r + m + g, r)."""
         rows, limits = faces.rows, self.plant.input_half
         gains = slice(len(rows), len(rows) + self.plant.m)
         reached = rows @ self.rest.state
         own = Faces(rows * self.widths, faces.low - reached, faces.high - reached)
-        within = limits_within_step(self._feedback, self.plant).images
+        within = limits_within_step(self._feedback, self.plant).rows
         images = np.concatenate([rows @ self.next, self._K / limits[:, None], within]) * self.widths
         found = np.array([multipliers_of(own, image) for image in images])
         found[np.abs(found) < 1e-13] = 0.0
@@ -440,8 +368,7 @@ def _without_implied(faces: Faces, kept: int, implied: float, count: int = 0) ->
 def _bounding_every_state(faces: Faces, kept: int) -> Faces:
     """Returns faces of which those with two ends bound every state, as proofs ask for, if the polytope is bounded.
 
-    An open end is closed where the others imply it already; the `kept` first rows stay as they are, and are followed by
-    a closed copy. What keeps the others keeps such an end, too.
+    An open end is closed where the others imply it; the `kept` first rows are followed by a closed copy instead.
     """
     rows, low, high = (part.copy() for part in faces)
     closed = np.isfinite(low) & np.isfinite(high)
@@ -461,17 +388,3 @@ def _bounding_every_state(faces: Faces, kept: int) -> Faces:
             low[i], high[i] = ends
             closed[i] = True
     return Faces(rows, low, high)
-
-
-def _rounded(step: _ClosedLoop, faces: Faces) -> Polytope:
-    physical = step.in_physical_units(faces)
-    upper, lower = step.multipliers(physical)
-    rest = step.rest.state
-    return Polytope(
-        rows=physical.rows,
-        low=physical.low,
-        high=physical.high,
-        center=rest,
-        multipliers=upper,
-        lower_multipliers=lower,
-    )

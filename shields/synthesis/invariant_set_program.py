@@ -30,7 +30,7 @@ class InvariantSetProgram:
     """
 
     def __init__(self, problem: DesignProblem, slack: float) -> None:
-        n, m = problem.n, problem.m
+        n, m = problem.B.shape
         self._problem, self._slack = problem, slack
         self._error_factors = list(np.linalg.cholesky((1.0 + slack) * problem.maximal_error_shapes))
         self._unit = 1.0 / np.maximum(np.linalg.norm(problem.B, axis=0), 1.0)
@@ -102,7 +102,7 @@ def max_slack_gain(problem: DesignProblem, design: CandidateDesign) -> np.ndarra
     The slack is measured by the smallest t for which t L bounds the successors. If the solver fails, the design's own
     gain is returned.
     """
-    n, m = problem.n, problem.m
+    n, m = problem.B.shape
     L, (lx, le, ld), identity, zero = design.L, design.multipliers, np.eye(n), np.zeros((n, n))
     K, t = cp.Variable((m, n)), cp.Variable()
     closed_loop = (problem.A + problem.B @ K) @ L

@@ -30,7 +30,7 @@ def best_multipliers(
         error_shapes: Shapes of the error sets, scaled, (k, n, n).
         L: Shape of the set, scaled, (n, n).
         K: Gain, scaled, shape (m, n).
-        initial: Multipliers from which the minimization starts.
+        initial: Where the minimization starts.
     """
     inverse_factor = np.linalg.inv(np.linalg.cholesky(L))
     # Shapes of what state, errors and disturbance each add to the successors, in coordinates in which E(L) is a ball.
@@ -59,12 +59,7 @@ def best_multipliers(
 def best_input_multipliers(error_shapes: np.ndarray, L: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Returns the multipliers mu_i of (U), shape (m,): the fraction of the largest input that is due to the state.
 
-    mu_i = a / (a + b), a = sqrt(K_i L K_i') due to the state, b = max sqrt(K_i Sigma K_i') due to the error.
-
-    Args:
-        error_shapes: Shapes of the error sets, scaled, (k, n, n).
-        L: Shape of the set, scaled, (n, n).
-        K: Gain, scaled, shape (m, n).
+    mu_i = a / (a + b), a = sqrt(K_i L K_i') due to the state, b = max sqrt(K_i Sigma K_i') due to the error, scaled.
     """
     by_state = np.sqrt(np.maximum(((K @ L) * K).sum(axis=1), 0.0))
     by_error = np.sqrt(np.maximum(((K @ error_shapes) * K).sum(axis=-1), 0.0)).max(axis=0)

@@ -10,11 +10,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from ncs_gym import ChannelContract, LinearPlant
 from ncs_gym.network.contract import MAX_AGE
 from ncs_gym.validation import as_count, as_number
 from shields.certificate import Certificate
-from shields.synthesis.certification import nearby_certificate
+from shields.errors import Infeasible
+from shields.synthesis.certification import first_certificate
+from shields.synthesis.search import Search
 
 # Ages that are asked about by default [steps].
 AGES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -70,11 +74,7 @@ class Requirements:
 
 
 def share_of(certificate: Certificate) -> tuple[str, float]:
-    """Returns what fills how much of the safe box: ("ellipsoid", share), of limits with two ends ("polytope", share).
-
-    Where the box has more rows than states, the share of its largest ellipsoid; ("certificate", 1.0)
-    where nothing is known, as of a box that is open.
-    """
+    """Returns what fills how much of the safe box: "ellipsoid", "polytope", or ("certificate", 1.0) if not known."""
     known, polytope = certificate.provenance, certificate.polytope
     if polytope is not None and not certificate.keeps_ellipsoid and not polytope.is_symmetric:
         share = known.get("polytope_share_of_box")
@@ -88,6 +88,7 @@ def _cell(certificate: Certificate | None) -> str:
     return "-" if certificate is None else f"{100.0 * share_of(certificate)[1]:.3g}"
 
 
+@np.errstate(all="ignore")
 def requirements(
     plant: LinearPlant,
     *,
@@ -97,8 +98,8 @@ def requirements(
 ) -> Requirements:
     """Returns under which contracts a plant has a certificate, each of them verified.
 
-    Each is sought near that of the age before. A contract that promises less than one for which none was found is not
-    tried, and one that promises more has at least the share of the others.
+    Each is sought as `synthesize` does, without a polytope around an ellipsoid. A contract that promises less than one
+    for which none was found is not tried, and one that promises more has at least the share of the others.
 
     Args:
         plant: The plant with its bounds.
@@ -118,12 +119,14 @@ def requirements(
             raise ValueError(f"{name} must be different values, at least one")
     found: list[list[Certificate | None]] = [[None] * len(steps) for _ in asked]
     for j, step in enumerate(steps):
-        last: Certificate | None = None
         for i, age in enumerate(asked):
-            if (i and last is None) or (j and found[i][j - 1] is None):
+            if j and found[i][j - 1] is None:
                 break
             progress(f"max_age {age}, resolution {step:g}")
-            last = found[i][j] = nearby_certificate(plant, ChannelContract(age, step), last)
+            try:
+                found[i][j] = first_certificate(plant, ChannelContract(age, step), Search(progress))
+            except Infeasible:
+                break
     for i in reversed(range(len(asked))):  # a certificate is one of every contract that promises more
         for j in reversed(range(len(steps))):
             stricter = (*(row[j] for row in found[i + 1 : i + 2]), *found[i][j + 1 : j + 2])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from ncs_gym import LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
 from shields.certificate import Certificate
-from shields.errors import CertificateError, Infeasible
+from shields.errors import Infeasible
 from shields.polytope import Polytope
 from shields.synthesis.certificate_fields import (
     fields_of_problem,
@@ -23,21 +23,21 @@ from shields.synthesis.certificate_fields import (
 )
 from shields.synthesis.design_problem import Rest, design_problem
 from shields.synthesis.diagnosis import infeasibility
-from shields.synthesis.ellipsoid_certificates import MORE_DIGITS
+from shields.synthesis.ellipsoid_certificates import MORE_DIGITS, failed_verification
 from shields.synthesis.invariant_polytope import (
+    MARGINS,
     Feedback,
     feedback_of,
-    invariant_polytopes,
+    invariant_polytope,
     points_of_box,
     share_in_polytope,
-    share_of_last_input,
     share_of_points,
 )
 from shields.synthesis.resting_point import (
-    at_operating_point,
     disturbance_around,
     improved,
     limits_around,
+    needs_resting_point,
 )
 from shields.synthesis.search import Progress
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
@@ -51,79 +51,47 @@ _POINTS_OF_REST_LOG2 = 12
 # For so many gains a polytope is sought.
 _MOST_SOUGHT = 4
 # What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
-_NOT_CERTIFIED = (Infeasible, ArithmeticError, ValueError, CertificateError)
+_NOT_CERTIFIED = (ArithmeticError, ValueError)
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
     """Returns a verified certificate with the largest polytope that its gain keeps in the box.
 
-    One that keeps a polytope alone is returned as it is. Without a polytope if none is found; its provenance, and so
-    the printed certificate, says why.
-
-    Args:
-        certificate: A verified one.
-        plant: Its plant.
-        progress: Called with a line of text now and then.
+    One that keeps a polytope alone is returned as it is. If none is found, the provenance, and so the printed
+    certificate, says why.
     """
     if not certificate.keeps_ellipsoid:
         return certificate
     try:
-        polytopes = invariant_polytopes(feedback_of(certificate), plant, progress)
-        return _first_verified((replace(certificate, polytope=each) for each in polytopes), plant, progress)
+        return _with_polytope_of(
+            feedback_of(certificate), plant, lambda polytope: replace(certificate, polytope=polytope), progress
+        )
     except _NOT_CERTIFIED as failure:
-        reason = _reason_of(failure)
+        reason = reason_of(failure)
     return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
 
 
-def _reason_of(failure: Exception) -> str:
-    """Returns why there is no polytope; what a library says of numbers stands in parentheses."""
+def reason_of(failure: Exception) -> str:
+    """Returns why there is no certificate; what a library says of numbers stands in parentheses."""
     if isinstance(failure, Infeasible):
         return str(failure)
     return f"its numbers are out of reach of float64 ({failure}): {MORE_DIGITS}"
 
 
-def certify_polytope(
-    plant: LinearPlant,
-    K: np.ndarray,
-    contract: ChannelContract | None = None,
-    progress: Progress = lambda line: None,
-    rest: Rest | None = None,
-) -> Certificate | None:
-    """Returns a verified certificate with the largest polytope that a given gain keeps in the box; None for none.
-
-    The polytope alone is claimed to be invariant; L is that of the largest ellipsoid inside it, and inside generous
-    limits where states have none.
-
-    Args:
-        plant: The plant with its bounds.
-        K: Gain, shape (m, n) [input per state].
-        contract: Channel contract; with one, the error sets depend on the age of the newest sample.
-        progress: Called with a line of text now and then.
-        rest: The point around which it is sought; the operating point by default.
-
-    Raises:
-        Infeasible: If the plant has no error set or its safe box is unbounded.
-    """
-    try:
-        rest = at_operating_point(plant) if rest is None else rest
-        return _certified_polytope(plant, K, contract, progress, rest)
-    except _NOT_CERTIFIED as failure:
-        if isinstance(failure, Infeasible) and failure.binding not in ("P", "R"):
-            raise
-        return None
-
-
-def _certified_polytope(
+def certified_polytope(
     plant: LinearPlant,
     K: np.ndarray,
     contract: ChannelContract | None,
-    progress: Progress,
     rest: Rest,
+    progress: Progress = lambda line: None,
 ) -> Certificate:
-    """Returns what `certify_polytope` does.
+    """Returns a verified certificate with the largest polytope that a given gain keeps in the box.
+
+    The polytope alone is claimed to be invariant; L is that of the largest ellipsoid inside it, and inside generous
+    limits where states have none. The gain K is of shape (m, n) [input per state].
 
     Raises:
-        Infeasible, ArithmeticError, ValueError, CertificateError: If there is none; the message says why.
+        ArithmeticError, ValueError: If there is none; the message says why.
     """
     limits = limits_around(plant, rest)
     problem, errors = design_problem(plant, contract, limits)
@@ -141,65 +109,57 @@ def _certified_polytope(
         L = shape_in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
         return Certificate(L=L, polytope=polytope, provenance=provenance_of(plant, L), **others)
 
-    return _first_verified(map(certificate, invariant_polytopes(feedback, plant, progress)), plant, progress)
+    return _with_polytope_of(feedback, plant, certificate, progress)
 
 
-def _first_verified(candidates: Iterable[Certificate], plant: LinearPlant, progress: Progress) -> Certificate:
-    """Returns the first candidate that verifies.
+def _with_polytope_of(
+    feedback: Feedback, plant: LinearPlant, certificate_with: Callable[[Polytope], Certificate], progress: Progress
+) -> Certificate:
+    """Returns a verified certificate with the polytope of a fallback, sought with one margin after the other.
 
     Raises:
-        Infeasible, ArithmeticError, ValueError, CertificateError: If none does; the message says why the first fails.
+        ArithmeticError, ValueError: If there is none; the message says why the first is.
     """
     failure: Exception | None = None
-    try:
-        for each in candidates:
-            try:
-                return _verified_polytope(each, plant, progress)
-            except _NOT_CERTIFIED as failed:
-                failure = failure or failed
-    except _NOT_CERTIFIED as ended:
-        failure = failure or ended
+    for margin in MARGINS:
+        try:
+            polytope = invariant_polytope(feedback, plant, margin, progress)
+        except _NOT_CERTIFIED as none:
+            failure = failure or none
+            progress(f"polytope: {none}")
+            if isinstance(none, Infeasible) and none.binding != "R" and margin == min(MARGINS):
+                break  # a larger margin leaves less
+            continue
+        try:
+            return _verified_polytope(certificate_with(polytope), plant, progress)
+        except _NOT_CERTIFIED as none:
+            failure = failure or none
     assert failure is not None
     raise failure
 
 
 def around_resting_point(
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    gains: Sequence[Tolerated],
-    progress: Progress,
-    fixed: Rest | None = None,
+    plant: LinearPlant, contract: ChannelContract | None, gains: Sequence[Tolerated], progress: Progress
 ) -> Certificate:
     """Returns a verified certificate of a polytope alone, around a resting point.
 
-    One polytope is sought for each of the `_MOST_SOUGHT` first gains, and for the most tolerant one.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract; None for none.
-        gains: Gains that are tried if they bear the radii.
-        progress: Called with a line of text now and then.
-        fixed: The resting point; the one that suits each gain by default.
+    One polytope is sought for each of the `_MOST_SOUGHT` first gains that bear the radii, and for the most tolerant.
 
     Raises:
         Infeasible: If there is none: why the polytope of the first gain was given up.
     """
-    tried = _by_share([each for each in gains if each.margin >= 1.0], plant, contract, progress, fixed)
+    tried = _by_share([each for each in gains if each.margin >= 1.0], plant, contract, progress)
     best, reasons = most_tolerant(gains), list[str]()
     for each in [*tried[:_MOST_SOUGHT], *(each for each in tried[_MOST_SOUGHT:] if each is best)]:
         try:
-            return _certified_polytope(plant, each.K, contract, progress, each.rest)
+            return certified_polytope(plant, each.K, contract, each.rest, progress)
         except _NOT_CERTIFIED as failure:
-            reasons.append(_reason_of(failure))
+            reasons.append(reason_of(failure))
     raise infeasibility(plant, best, polytope=True, reason=reasons[0] if reasons else "")
 
 
 def _by_share(
-    gains: Sequence[Tolerated],
-    plant: LinearPlant,
-    contract: ChannelContract | None,
-    progress: Progress,
-    fixed: Rest | None,
+    gains: Sequence[Tolerated], plant: LinearPlant, contract: ChannelContract | None, progress: Progress
 ) -> list[Tolerated]:
     """Returns gains that differ in a certificate's digits, those that keep the most of the box first.
 
@@ -217,7 +177,7 @@ def _by_share(
 
     shares = np.array([share(each.K, each.rest) for each in gains])
     gains = [gains[k] for k in np.argsort(-shares, kind="stable")]
-    if fixed is None:
+    if needs_resting_point(plant):
         progress(f"resting point: {100.0 * shares.max():.1f} % of the box")
         better = improved(plant, gains[0].rest, lambda rest: share(gains[0].K, rest))
         gains = [gains[0]._replace(rest=better), *gains] if better is not gains[0].rest else gains
@@ -234,19 +194,8 @@ def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: P
     progress(f"exact verification: a polytope of {len(certificate.polytope.rows)} rows")
     report = verify(certificate, plant)
     if not report.valid:
-        failed = next(condition for condition in report.conditions if not condition.holds)
-        reason = f"in exact arithmetic {failed.name} fails by {-failed.margin:.3g}: {MORE_DIGITS}"
-        raise Infeasible(reason, "P", -failed.margin)
-    shares = {
-        "polytope_share_of_box": share_in_polytope(certificate.polytope, plant),
-        "share_of_last_input": share_of_last_input(certificate.polytope, plant),
-    }
-    sizes = {name: float(exact.rounded(share, 3)) for name, share in shares.items() if share is not None}
-    reach = {} if "polytope_share_of_box" in sizes else reach_recorded(certificate.polytope, plant)
+        raise failed_verification(report)
     others = {name: value for name, value in certificate.provenance.items() if name != "reach"}
-    return replace(certificate, provenance=others | sizes | reach)
-
-
-def polytope_share(certificate: Certificate) -> float:
-    """Returns the share of the safe box that a certificate's polytope fills, as far as it is known; 0.0 otherwise."""
-    return certificate.provenance.get("polytope_share_of_box", 0.0)
+    if (share := share_in_polytope(certificate.polytope, plant)) is None:
+        return replace(certificate, provenance=others | reach_recorded(certificate.polytope, plant))
+    return replace(certificate, provenance=others | {"polytope_share_of_box": float(exact.rounded(share, 3))})

@@ -13,14 +13,11 @@ from ncs_gym import LinearPlant, exact
 from ncs_gym.plants.hard_bounds import inflated, weight_of
 from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.uncertainty.shape_matrices import outer_sum
-from ncs_gym.validation import shown
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import Rest, SymmetricLimits, taken_between_samples
 
 # Significant digits of a resting point, in units of the limits: what differs between processors is beyond them.
 _DIGITS = 12
-# What a state changes by in a step at rest, next to its terms, is rounding up to this.
-_HELD = 1e-12
 # The search for a better point takes steps of these sizes along every direction of the equilibria, in units of the
 # distance at which some limit is reached, as long as one of them helps.
 _STEPS = (0.4, 0.2, 0.1, 0.05, 0.02)
@@ -37,7 +34,7 @@ _LEAST_PRICE = 1e-3
 
 
 def at_operating_point(plant: LinearPlant) -> Rest:
-    """Returns the operating point itself, zero: where fallbacks of plants with symmetric limits rest."""
+    """Returns zero, where fallbacks of plants with symmetric limits rest."""
     return Rest(np.zeros(plant.n), np.zeros(plant.m))
 
 
@@ -49,14 +46,12 @@ def equilibria(plant: LinearPlant) -> np.ndarray:
 
 
 class LimitRows(NamedTuple):
-    """All limits low <= rows (x, u) <= high, in units of half their range: of the box, the inputs, of both together.
-
-    With what disturbances are given, the box at the times of the plant's grid follows, time by time.
+    """Limits low <= rows (x, u) <= high, in units of half their range: of the box, the inputs, of both together.
 
     Attributes:
         rows: Shape (r, n + m).
         low, high: Shape (r,).
-        disturbed: Support of what has come by then of the disturbance, shape (r,); 0 but at times of the grid.
+        disturbed: Support of what has come by then of the disturbance, shape (r,); 0 but between samples.
     """
 
     rows: np.ndarray
@@ -66,7 +61,7 @@ class LimitRows(NamedTuple):
 
 
 def limit_rows(plant: LinearPlant, D: np.ndarray | None = None) -> LimitRows:
-    """Returns the limits of a plant, and for disturbances of the shape D, (n, n), those between samples."""
+    """Returns the limits of a plant, and for disturbances of the shape D, (n, n), those between samples, by time."""
     box = np.hstack([plant.box, np.zeros((len(plant.box), plant.m))])
     inputs = np.hstack([np.zeros((plant.m, plant.n)), np.diag(1.0 / plant.input_half)])
     rows = np.concatenate([box, inputs, plant.mixed_rows])
@@ -93,39 +88,19 @@ def needs_resting_point(plant: LinearPlant) -> bool:
 
 
 class Farthest(NamedTuple):
-    """An equilibrium that is farthest from the limits.
-
-    Attributes:
-        rest: The equilibrium.
-        distance: Of the nearest limit, in units of what is needed.
-        binding: The rows that nearest limits belong to, as those of `distances`.
-    """
+    """An equilibrium, its distance from the nearest limits in units of what is needed, and the numbers of these."""
 
     rest: Rest
     distance: float
     binding: np.ndarray
 
 
-def farthest_from_limits(plant: LinearPlant) -> Rest:
-    """Returns the equilibrium whose nearest limit is farthest away, in half ranges.
-
-    Raises:
-        Infeasible: If no equilibrium is strictly within the limits.
-    """
-    return farthest_equilibrium(plant).rest
-
-
 def farthest_equilibrium(
     plant: LinearPlant, needs: np.ndarray | None = None, limits: LimitRows | None = None
 ) -> Farthest:
-    """Returns the equilibrium whose nearest limit is farthest away with the limits that are nearest.
+    """Returns the equilibrium whose nearest limit is farthest away, by a linear program.
 
-    It is found by a linear program.
-
-    Args:
-        plant: The plant.
-        needs: What distances from the limits are in units of, shape (r,), > 0; half the range by default.
-        limits: The r limits; those of `limit_rows` by default.
+    Distances from the limits, by default those of `limit_rows`, are in units of `needs`, by default of half the range.
 
     Raises:
         Infeasible: If no equilibrium is strictly within the limits.
@@ -158,36 +133,8 @@ def rest_at(plant: LinearPlant, point: np.ndarray) -> Rest:
     return Rest(rounded[: plant.n], rounded[plant.n :])
 
 
-def resting_at(plant: LinearPlant, state: np.ndarray) -> Rest:
-    """Returns the resting point at a state, shape (n,), with the smallest input that holds it.
-
-    Raises:
-        ValueError: If no input holds it, or it is not strictly within the limits.
-    """
-    missing = state - plant.A @ state
-    widths = plant.half_widths
-    applied = plant.input_half * np.linalg.lstsq(plant.B * plant.input_half / widths[:, None], missing / widths)[0]
-    terms = np.abs(plant.A) @ np.abs(state) + np.abs(plant.B) @ np.abs(applied) + np.abs(state)
-    left = plant.B @ applied - missing
-    if not (np.abs(left) <= _HELD * terms).all():
-        raise ValueError(
-            f"resting_state must be an equilibrium, and no input holds {shown(state.tolist())}: with the best one, "
-            f"{shown(applied.tolist())}, a step changes it by {shown(left.tolist())}"
-        )
-    rest = Rest(state, applied)
-    if not (distances(plant, rest) > 0.0).all():
-        raise ValueError(
-            f"resting_state must be strictly within the limits, and so must the input that holds it, "
-            f"{shown(applied.tolist())} (deviations from the operating point), got {shown(state.tolist())}"
-        )
-    return rest
-
-
 def distances(plant: LinearPlant, rest: Rest) -> np.ndarray:
-    """Returns how far a point is from the nearer end of every limit, in units of half its range, shape (k + m + q,).
-
-    Of the k rows of the box, of the m inputs, and of the q limits of both together.
-    """
+    """Returns how far a point is from the nearer end of every limit of `limit_rows`, in units of half its range."""
     ends = around(limit_rows(plant), rest)
     return np.minimum(-ends.low, ends.high)
 
@@ -219,11 +166,7 @@ def disturbance_around(plant: LinearPlant, rest: Rest) -> np.ndarray:
 
 
 def units_of_states(plant: LinearPlant, rest: Rest) -> np.ndarray:
-    """Returns the size of each state, shape (n,): the plant's half-widths, or if some are free of `limits_around`.
-
-    Raises:
-        Infeasible: If the point is not strictly within the limits.
-    """
+    """Returns the size of each state, shape (n,): the plant's half-widths, or if some are free of `limits_around`."""
     if exact.rank(plant.box) == plant.n:
         return plant.half_widths
     rows = limits_around(plant, rest).box_rows
@@ -231,10 +174,7 @@ def units_of_states(plant: LinearPlant, rest: Rest) -> np.ndarray:
 
 
 def _generous_rows(plant: LinearPlant, rows: np.ndarray, u_max: np.ndarray) -> np.ndarray:
-    """Returns rows that limit every state which no row limits alone, (j, n), about to where a regulator lets it go.
-
-    Where that is not known, to the half-widths of the plant.
-    """
+    """Returns rows that limit every state which no row limits alone, (j, n), about to where a regulator lets it go."""
     free = np.flatnonzero(
         [not any(np.count_nonzero(row) == 1 and row[i] != 0.0 for row in rows) for i in range(plant.n)]
     )
@@ -264,13 +204,7 @@ def _farthest(rows: np.ndarray, i: int) -> float:
 
 
 def improved(plant: LinearPlant, rest: Rest, share: Callable[[Rest], float]) -> Rest:
-    """Returns an equilibrium with a larger share of the box, by a search along one direction after the other.
-
-    Args:
-        plant: The plant.
-        rest: Where it begins.
-        share: Of the box that is kept from a resting point.
-    """
+    """Returns an equilibrium with a larger share of the box, by a search along one direction after the other."""
     directions, best, most = equilibria(plant), rest, share(rest)
     for step in _STEPS:
         for _ in range(_MOST_TURNS):

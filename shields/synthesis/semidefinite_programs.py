@@ -24,21 +24,14 @@ def is_solved(program: cp.Problem) -> bool:
 
 
 def value_of(variable: cp.Variable) -> np.ndarray:
-    """Returns the value of a variable of a solved program.
-
-    Raises:
-        ValueError: If the solver found none.
-    """
+    """Returns the value of a variable of a solved program; raises ValueError if the solver found none."""
     if variable.value is None:
         raise ValueError(f"the solver found no value of {variable}")
     return variable.value
 
 
 def largest_box_ellipsoid(C: np.ndarray) -> np.ndarray:
-    """Returns the shape (n, n) of the largest ellipsoid in the box {|c_j x| <= 1}.
-
-    Args:
-        C: Rows c_j of the box, shape (k, n), of full column rank.
+    """Returns the shape (n, n) of the largest ellipsoid in the box |C x| <= 1, C of shape (k, n) and full column rank.
 
     Raises:
         Infeasible: If the solver fails.
@@ -60,13 +53,7 @@ def extreme_points(
 ) -> np.ndarray | None:
     """Returns the points z with the least and the largest row z, shape (2, q); None where a solver finds none.
 
-    Args:
-        row: Shape (q,).
-        rows: With low <= rows z <= high, shape (r, q).
-        low: Their low ends, shape (r,).
-        high: Their high ends, shape (r,).
-        cone: With |cone z| <= radius, shape (k, q); of no rows for none.
-        radius: The radius.
+    They are those with low <= rows z <= high, rows of shape (r, q), and |cone z| <= radius, for a cone of shape (k, q).
     """
     z, ends = cp.Variable(len(row)), []
     constraints: list[cp.Constraint] = [rows @ z >= low, rows @ z <= high]

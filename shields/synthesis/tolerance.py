@@ -20,7 +20,6 @@ from shields.synthesis.resting_point import (
     disturbance_around,
     equilibria,
     farthest_equilibrium,
-    farthest_from_limits,
     limit_rows,
     limits_around,
     needs_resting_point,
@@ -50,9 +49,9 @@ _EVALUATIONS, _LARGEST_LOGIT = 100, 12.0
 
 
 def regulators(plant: LinearPlant, decay: float = 1.0) -> list[np.ndarray]:
-    """Returns the gains, shape (m, n), of linear-quadratic regulators that use less and less of the inputs.
+    """Returns gains, (m, n), of linear-quadratic regulators with eigenvalues up to `decay` and less and less input.
 
-    Limits of states and inputs together cost as inputs do. Eigenvalues are at most `decay`.
+    Limits of states and inputs together cost as inputs do.
     """
     A, B = plant.A / decay, plant.B / decay
     state, pushed = plant.mixed_rows[:, : plant.n], plant.mixed_rows[:, plant.n :]
@@ -69,7 +68,7 @@ class Tolerated(NamedTuple):
 
     Attributes:
         K: The gain, shape (m, n).
-        rest: The resting point that suits it.
+        rest: Its resting point.
         margin: The factor.
         binding: The limits that are reached first, numbers of `limit_rows`.
     """
@@ -83,22 +82,16 @@ class Tolerated(NamedTuple):
 class Tolerance:
     """What radii a gain bears.
 
-    From rest errors and disturbances take a limited quantity c x at most as far as the sum of their supports, step by
-    step, by what the closed loop makes of the row c. Where that stays within all limits, the states that stay in them
-    for ever are a set around the resting point (Kolmanovsky and Gilbert 1998, docs/bibliography.md); elsewhere there is
-    none.
+    From rest errors and disturbances take a limited quantity c x as far as the sum of their supports along the rows
+    that the closed loop makes of c, step by step. Where that stays within all limits, the states that stay in them for
+    ever are a set around the resting point (Kolmanovsky and Gilbert 1998, docs/bibliography.md), else none is. The
+    resting point is the operating point where limits are symmetric, else the one that suits each gain.
+
+    Errors are of the shapes (l, n, n), disturbances of the shape D, (n, n).
     """
 
-    def __init__(self, plant: LinearPlant, errors: np.ndarray, D: np.ndarray, fixed: Rest | None = None) -> None:
-        """Begins with a plant.
-
-        Args:
-            plant: The plant.
-            errors: Shapes of the error sets, (l, n, n).
-            D: Shape of the disturbance set, (n, n).
-            fixed: The resting point; the one that suits each gain by default.
-        """
-        self._plant, self._fixed = plant, fixed
+    def __init__(self, plant: LinearPlant, errors: np.ndarray, D: np.ndarray) -> None:
+        self._plant, self._fixed = plant, None if needs_resting_point(plant) else at_operating_point(plant)
         self._x, self._u = plant.half_widths, plant.input_half
         self._A, self._B = plant.A * self._x / self._x[:, None], plant.B * self._u / self._x[:, None]
         self._errors, self._D = errors / np.outer(self._x, self._x), D / np.outer(self._x, self._x)
@@ -110,15 +103,11 @@ class Tolerance:
         found = self._needs_and_slopes(self._scaled(K), slopes=False)
         return None if found is None else self._around(K, found[0])
 
-    def improved(self, K: np.ndarray, enough: float = np.inf) -> Tolerated | None:
-        """Returns the gain of the largest margin near a given one: sequential quadratic programming, with derivatives.
+    def improved(self, K: np.ndarray) -> Tolerated | None:
+        """Returns the gain of the largest margin near a given one, by sequential quadratic programming.
 
-        None if the given one is too slow. The margin s, its inverse being minimized, and the resting point x_c are
-        variables: what a gain needs, and x_c / s, stay within the limits times 1 / s.
-
-        Args:
-            K: The given one, shape (m, n).
-            enough: The search ends once the margin is as large.
+        None if the given one, shape (m, n), is too slow. The inverse 1 / s of the margin is minimized, the resting
+        point x_c is a variable, too: what a gain needs, and x_c / s, stay within the limits times 1 / s.
         """
         best = self.of(K)
         if best is None:
@@ -155,8 +144,6 @@ class Tolerance:
             tried = self.of(self._physical(z[: K.size].reshape(shape) * sizes))
             if tried is not None and best is not None and tried.margin > best.margin:
                 best = tried
-            if best is not None and best.margin >= enough:
-                raise StopIteration
 
         units = np.concatenate([self._x, self._u])
         at = np.linalg.lstsq(directions / units[:, None], np.concatenate(best.rest) / units, rcond=None)[0]
@@ -194,7 +181,7 @@ class Tolerance:
     def _needs_and_slopes(self, K: np.ndarray, *, slopes: bool = True) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns how far errors and disturbances take every limit from rest under a scaled gain, in half ranges, (r,).
 
-        The second are the derivatives, shape (r, m, n), if they are asked for. None if the gain is too slow to tell.
+        With the derivatives, (r, m, n), if they are asked for. None if the gain is too slow to tell.
         """
         closed_loop, answer = self._A + self._B @ K, self._B @ K
         first = self._state + self._input @ K
@@ -258,7 +245,7 @@ def invariant_ellipsoid(problem: DesignProblem, K: np.ndarray) -> InvariantEllip
 
     For given multipliers (I) has a smallest solution, a Lyapunov series, which grows with the squares of the radii.
     """
-    _, K = problem.to_scaled(np.eye(problem.n), K)
+    K = (K @ problem.transform) / problem.u_max[:, None]
     BK, Sigma = problem.B @ K, problem.covering_error_shape
     closed_loop, from_errors = problem.A + BK, BK @ Sigma @ BK.T
     at_once = np.sqrt(np.maximum(((K @ Sigma) * K).sum(axis=1), 0.0))
@@ -285,29 +272,15 @@ def invariant_ellipsoid(problem: DesignProblem, K: np.ndarray) -> InvariantEllip
         return at(np.round(best.x, _DIGITS))
 
 
-def tolerated_gains(
-    plant: LinearPlant, contract: ChannelContract | None, fixed: Rest | None = None, enough: float = np.inf
-) -> list[Tolerated]:
-    """Returns gains with what they bear: the most tolerant one, and regulators.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract; None for none.
-        fixed: The resting point; the one that suits each gain by default.
-        enough: No more tolerant one is sought where one bears so much.
-
-    Raises:
-        Infeasible: If the plant has no error set, or no resting point.
-    """
-    rest = fixed or farthest_from_limits(plant)
+def tolerated_gains(plant: LinearPlant, contract: ChannelContract | None) -> list[Tolerated]:
+    """Returns the most tolerant gain and regulators; raises Infeasible without an error set or a resting point."""
+    rest = farthest_equilibrium(plant).rest if needs_resting_point(plant) else at_operating_point(plant)
     _, errors = design_problem(plant, contract, limits_around(plant, rest))
-    tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest), fixed)
+    tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest))
     pairs = zip(regulators(plant), regulators(plant, _FASTER), strict=False)
     gains = [found for K, faster in pairs if (found := tolerance.of(K) or tolerance.of(faster))]
     best = most_tolerant(gains)
-    if best is None or best.margin >= enough:
-        return gains
-    return [*filter(None, [tolerance.improved(best.K, enough)]), *gains]
+    return gains if best is None else [*filter(None, [tolerance.improved(best.K)]), *gains]
 
 
 def most_tolerant(gains: Sequence[Tolerated]) -> Tolerated | None:
@@ -315,22 +288,9 @@ def most_tolerant(gains: Sequence[Tolerated]) -> Tolerated | None:
     return max(gains, key=lambda each: each.margin, default=None)
 
 
-def most_tolerated(
-    plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool, enough: float = np.inf
-) -> Tolerated | None:
-    """Returns the gain that bears the most of the radii, of a polytope or an ellipsoid; None if no gain stabilizes.
-
-    Args:
-        plant: The plant.
-        contract: Channel contract, if there is one.
-        polytope: Whether it is enough that it keeps a polytope.
-        enough: A factor beyond which no larger one is sought.
-
-    Raises:
-        Infeasible: If there is no error set, or no equilibrium within the limits.
-    """
-    fixed = None if needs_resting_point(plant) else at_operating_point(plant)
-    gains = tolerated_gains(plant, contract, fixed, enough if polytope else np.inf)
+def most_tolerated(plant: LinearPlant, contract: ChannelContract | None, *, polytope: bool) -> Tolerated | None:
+    """Returns the gain that bears the most with a polytope, or else an ellipsoid; None if none stabilizes."""
+    gains = tolerated_gains(plant, contract)
     if not polytope:
         problem, _ = design_problem(plant, contract)
         pairs = [(each, invariant_ellipsoid(problem, each.K)) for each in gains]

@@ -97,17 +97,10 @@ def _closed_loop_conditions(certificate: Certificate, plant: LinearPlant) -> Ite
 
 
 def _remainder(row: list[Fraction], grid: Matrix, G: Matrix, sizes: list[Fraction], dt: Fraction) -> Fraction | None:
-    """Returns the least eta that is proved for a row [c, 0] and its rows on the grid; None if a series is too long.
+    """Returns the least eta that is proved for a row [c, 0]; None if a series is too long.
 
-    That is the largest error of the rows and h^2/8 exp(h m) max_i |[c, 0] exp(G tau_i) G^2|, measured by what they can
-    reach for |z_j| <= W_j; m is the logarithmic norm of G.
-
-    Args:
-        row: [c, 0].
-        grid: What the plant has for [c, 0] exp(G tau_i), i = 0..N.
-        G: The generator.
-        sizes: W.
-        dt: Duration of a step.
+    That is the largest error of the plant's grid for [c, 0] exp(G tau_i), i = 0..N, and h^2/8 exp(h m) max_i
+    |[c, 0] exp(G tau_i) G^2|, measured by what they can reach for |z_j| <= W_j; m is the logarithmic norm of G.
     """
     points = len(grid) - 1
     h, error, bend, square = dt / points, Fraction(0), Fraction(0), multiply(G, G)
@@ -135,14 +128,8 @@ def _moved(
 
     After the term of power p, left is at most |row| (t |G|)^(p+1) / (p+1)! / (1 - t |G| / (p+2)), with norm = |G|.
     Entry j of a term is a whole number of 2^-b / 2^(e_j), e_j least with W_j <= 2^(e_j), so that numbers stay short:
-    rounding adds at most N 2^-b to each of p + 1 terms, and grows in later ones by at most exp(t |G|).
-
-    Args:
-        row: The row, shape (N,).
-        G: The generator; its numbers are floats or others whose denominators are powers of two.
-        sizes: W, shape (N,), by which |row| = sum |row_j| W_j.
-        time: t.
-        norm: |G|.
+    rounding adds at most N 2^-b to each of p + 1 terms, and grows in later ones by at most exp(t |G|). |row| is
+    sum |row_j| W_j; the denominators of G are powers of two.
     """
     reach, size = time * norm, weighted_size(row, sizes)
     if 2 * reach > _MOST_TERMS or size == 0:

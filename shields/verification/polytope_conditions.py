@@ -110,14 +110,7 @@ class Faces(NamedTuple):
     widths: list[Fraction]
 
     def left_of(self, image: list[Fraction], number: int, low: Fraction | None, high: Fraction | None) -> Fraction:
-        """Returns the least distance of image x from two ends while x is in the polytope, as multipliers prove it.
-
-        Args:
-            image: The row, shape (n,).
-            number: Of its multipliers.
-            low: The lower end; None where there is none.
-            high: The upper end, likewise.
-        """
+        """Returns the least distance of image x from its ends in the polytope that multipliers prove."""
         distances = []
         if high is not None:
             distances.append(high - self._reach(image, self.multipliers[number], self.high, self.low))
@@ -142,12 +135,7 @@ class Faces(NamedTuple):
 
 
 def faces_of(polytope: Polytope, box_rows: int) -> Faces | None:
-    """Returns a polytope around its center in rational numbers; None if its rows do not bound every state.
-
-    Args:
-        polytope: The polytope.
-        box_rows: So many of its first rows are those of the safe box.
-    """
+    """Returns a polytope around its center in rational numbers; None if its rows do not bound every state."""
     rows, center = rational(polytope.rows), rational(polytope.center)[0]
     reached = [sum((g * c for g, c in zip(row, center, strict=True)), Fraction(0)) for row in rows]
     low, high = (
@@ -165,8 +153,7 @@ def widths_of(
 ) -> list[Fraction] | None:
     """Returns bounds of |x_k| over low <= g_j x <= high; None if there are none.
 
-    They follow from rows C that have two ends, |C x|_j <= s_j: from the first ones, or else from n that a factorization
-    in floats picks among all. Any rows would do.
+    They follow from rows with two ends: from the first ones, or else from n that a factorization in floats picks.
     """
     ends = zip(rows, low, high, strict=True)
     bounded = [
@@ -184,10 +171,7 @@ def widths_of(
 
 
 def half_widths(box: Matrix) -> list[Fraction] | None:
-    """Returns bounds of |x_k| over |c_j x| <= 1; None if there are none.
-
-    x = (C'C)^-1 C' y for |y_j| <= 1, so that is a sum of absolute values of a row of this matrix.
-    """
+    """Returns bounds of |x_k| over |c_j x| <= 1 from x = (C'C)^-1 C' y, |y_j| <= 1; None if there are none."""
     turned, n = transpose(box), len(box[0])
     rows = [gram + side for gram, side in zip(multiply(turned, box), turned, strict=True)]
     for i in range(n):

@@ -20,11 +20,10 @@ _AGE = re.compile(r"(?<=Sigma_)\d+| at age \d+| of row \d+")
 class Report:
     """The outcome of a verification.
 
-    Printed it begins with the verdict; of conditions that hold and differ in age or row alone, the one with the least
-    margin is printed.
+    Of conditions that hold and differ in age or row alone, the one with the least margin is printed.
 
     Attributes:
-        conditions: All conditions that were checked, in order; later ones are left out where earlier ones fail.
+        conditions: Those that were checked, in order; later ones are left out where earlier ones fail.
     """
 
     conditions: tuple[Condition, ...]
@@ -54,13 +53,8 @@ def _line(alike: list[Condition]) -> str:
 def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
 
-    The conditions are (E0), (E1), (I), (S), (U) of docs/shield_proof.md, and that D, N and r0^2 I contain what
-    its "Setting" says they contain; where there is a polytope (P) and (PU) of docs/shield_proof.md, too.
-    Neither a tolerance nor a solver nor a float decides; the margins are for people.
-
-    Args:
-        certificate: The certificate.
-        plant: The plant, with its bounds.
+    The conditions are those of docs/shield_proof.md, and that D, N and r0^2 I contain what its "Setting" says. Neither
+    a tolerance nor a solver nor a float decides; the margins are for people.
 
     Raises:
         ValueError: If an argument is of another kind.
@@ -76,14 +70,12 @@ def _require_kinds(certificate: Certificate, plant: LinearPlant) -> None:
         raise ValueError(f"verify takes a Certificate and a LinearPlant, got {kinds}")
 
 
-# Digests of the certificates and plants, as they were then, that have been verified in this process.
+# Digests of every number of certificates and plants that have been verified in this process.
 _valid: set[tuple[str, str, bytes]] = set()
 
 
 def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
     """Raises unless a certificate verifies for a plant; what has verified in this process is not verified again.
-
-    Both are told apart by digests of every number that they hold now.
 
     Raises:
         CertificateError: Naming the first condition that does not hold.
@@ -101,15 +93,10 @@ def _require_conditions(certificate: Certificate, plant: LinearPlant) -> None:
     for condition in verify(certificate, plant).conditions:
         if not condition.holds:
             if condition.name.startswith("plant"):
-                other = "made for another plant (fingerprints differ)"
-                if certificate.between_samples != plant.between_samples:
-                    made, asked = (_when(points) for points in (certificate.between_samples, plant.between_samples))
-                    other = f"made for another plant, or for a box that counts {made}: here it counts {asked}"
-                raise CertificateError(f"the certificate was {other}: synthesize one for this plant")
+                raise CertificateError(
+                    "the certificate was made for another plant, or for other times at which its box counts "
+                    "(fingerprints differ): synthesize one for this plant"
+                )
             raise CertificateError(
                 f"the certificate does not verify: {condition.name} does not hold (margin {condition.margin:.3g})"
             )
-
-
-def _when(points: int | None) -> str:
-    return "at the sampling instants" if points is None else f"at all times (between_samples={points})"

@@ -17,7 +17,6 @@ from experiments.runs.arms import Arm
 from experiments.runs.loops import changed_channel, scenario_named, worse_channel
 from experiments.settings import BackendSettings
 from ncs_gym import Channel, ChannelContract
-from tests.certificates import feasible_age_not_sought
 from tests.command import assert_one_sentence, ncs
 
 NAN, INF = float("nan"), float("inf")
@@ -99,7 +98,7 @@ ONE_SENTENCE = [
 
 # Known without a certificate, which may take minutes.
 BEFORE_A_CERTIFICATE = [
-    ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a covariance"),
+    ("compare --env ncs_gym/CSTR-v0 --scenarios gaussian", "noise=\"gaussian\" needs a Gaussian"),
     ("sweep --env ncs_gym/TruckTrailer-v0 --arms governor", "unknown arm 'governor'; known are unshielded"),
 ]  # fmt: skip
 
@@ -131,8 +130,7 @@ def test_calls_are_refused(call, words):
 
 @pytest.mark.parametrize(("line", "words"), USAGE)
 def test_usage_errors_are_the_parsers(line, words):
-    with feasible_age_not_sought():
-        run = ncs(*line.split(), COLUMNS="200")
+    run = ncs(*line.split(), COLUMNS="200")
     assert run.returncode == 2
     assert "Traceback" not in run.stderr
     assert words in " ".join(run.stderr.replace("│", " ").split())

@@ -55,31 +55,15 @@ def assert_noticed(data, certificate, path):
     return loaded is None
 
 
-def assert_every_byte_counts(name, positions, path):
-    _, certificate = case(name)
-    certificate.save(path)
-    data, refused = path.read_bytes(), 0
-    assert assert_noticed(data, certificate, path) == 0
-    places = [(at, kind) for at, kind in positions(len(data)) if at < len(data)]
-    for at, kind in places:
-        refused += assert_noticed(damaged(data, at, kind), certificate, path)
-    # What may change unnoticed is white space: most of the file is none.
-    assert refused > 0.5 * len(places)
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_damage_at_any_byte_is_noticed(name, tmp_path):
-    def some(length):
-        return [(at, KINDS[at // STEP % len(KINDS)]) for at in range(0, length, STEP)]
-
-    assert_every_byte_counts(name, some, tmp_path / "c.json")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", CASES)
-def test_damage_at_every_byte_is_noticed(name, kind, tmp_path):
-    assert_every_byte_counts(name, lambda length: [(at, kind) for at in range(length)], tmp_path / "c.json")
+    certificate, path = case(name)[1], tmp_path / "c.json"
+    certificate.save(path)
+    data = path.read_bytes()
+    assert not assert_noticed(data, certificate, path)
+    kinds = [(at, KINDS[at // STEP % len(KINDS)]) for at in range(0, len(data), STEP)]
+    refused = sum(assert_noticed(damaged(data, at, kind), certificate, path) for at, kind in kinds)
+    assert refused > 0.5 * len(kinds)  # what may change unnoticed is white space: most of the file is none
 
 
 def leaves(value, path=()):
@@ -132,14 +116,3 @@ def test_certificates_forged_at_random_are_refused_or_true(tmp_path_factory, dat
         if not leaves(content):
             break
     judged(content, plant, path)
-
-
-@given(extra=st.dictionaries(st.sampled_from(["L", "K", ""]), st.none() | st.integers() | st.just("1"), max_size=3))
-@examples(10)
-def test_documents_of_any_structure_are_refused(tmp_path_factory, extra):
-    path = tmp_path_factory.getbasetemp() / "any.json"
-    for document in (extra, [extra], {"format": "ncs-gym certificate 3"} | extra, {"certificate": extra, "sha256": ""}):
-        path.write_text(json.dumps(document))
-        with pytest.raises(CertificateError):
-            Certificate.load(path)
-    assert forged(extra, path) is None

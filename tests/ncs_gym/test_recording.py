@@ -117,6 +117,7 @@ def test_outputs_that_do_not_tell_a_direction_leave_no_upper_bound_of_it():
     assert found.bounds(2.0, of="explaining", first_error=0.1).disturbance.half == pytest.approx(2 * found.explaining)
 
 
+@pytest.mark.slow
 def test_two_thousand_steps_of_four_states_take_twenty_seconds_at_most():
     model, _, half, phi = case_of("cart_pole")
     u, y, _ = driven(model, 2000, half, phi)

@@ -12,19 +12,21 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box, Discrete
 
 from ncs_gym import (
     Actuator,
     AdversarialDisturbance,
     Bounds,
+    Box,
     BoxDisturbance,
     Channel,
     ChannelContract,
     Ellipsoid,
     ErrorSetError,
     FunctionProcess,
+    Gaussian,
     GymProcess,
     Limits,
     LinearPlant,
@@ -125,7 +127,7 @@ def modeled(process=swing, state=(0.25, 1.5), **settings):
 class Inner(gym.Env):
     """A Gymnasium environment with two states."""
 
-    observation_space, action_space = Box(-np.inf, np.inf, (2,)), Box(-1.0, 1.0, (1,))
+    observation_space, action_space = spaces.Box(-np.inf, np.inf, (2,)), spaces.Box(-1.0, 1.0, (1,))
 
     def reset(self, *, seed=None, options=None):
         self.state = np.zeros(2)
@@ -136,11 +138,11 @@ ONE = Inner()
 
 
 class Counted(Inner):
-    action_space = Discrete(2)
+    action_space = spaces.Discrete(2)
 
 
 class Wide(Inner):
-    action_space = Box(-1.0, 1.0, (3,))
+    action_space = spaces.Box(-1.0, 1.0, (3,))
 
 
 def write(env, state):
@@ -296,22 +298,24 @@ PLANTS = [
         Model,
         {
             "B": [np.ones((3, 1)), [0.5], [0, 0.5]],
-            "at": [([1.0], 0.0), ([1.0, 2.0], "10")],
+            "H": [[[0.0, 0.0]], [[1.0]]],
+            "at": [([1.0], 0.0), ([1.0, 2.0], "10"), 3.0, [0.5, 0.0]],
             "offset": [[1.0], [1.0, 2.0]],
             "continuous": [[[-2.0, 1.0]]],
-            "delays": [-1, 1.5, 101],
+            "delays": [-1, 1.5, 101, [1, 2]],
         },
         A=0.5 * np.eye(2),
         B=np.ones((2, 1)),
         H=None,
         dt=0.1,
     ),
-    *wrong(plant_of, {"model": [3, None], "limits": [3], "labels": [{"angle": "rad"}]}),
+    *wrong(plant_of, {"model": [3, None], "limits": [3], "bounds": [0.1]}),
+    *wrong(plant_of, {"labels": [{"angle": "rad"}, {"states": ["room"]}]}),
     *wrong(
         with_limits(PLAIN),
         {
-            "state": [[np.inf] * 2, ([-1.0, -2.0], [-0.5, 2.0])],
-            "input": [(-1.0, np.inf), (0.0, 1.0)],
+            "state": [[np.inf] * 2, ([-1.0, -2.0], [-0.5, 2.0]), [1.0], [-1.0, 2.0]],
+            "input": [(-1.0, np.inf), (0.0, 1.0), np.inf, None],
             "rows": [
                 3,
                 [([1.0, 0.0], -1.0, 1.0)],
@@ -337,21 +341,26 @@ PLANTS = [
     ),
     *(partial(plant_of, bounds=Bounds(**dict.fromkeys(SETS, 0.01) | {name: [0.1, 0.2]})) for name in SETS),
     lambda: plant_of(bounds=Bounds(EXAMPLE, 0.1, 0.1)),
+    lambda: plant_of(bounds=Bounds(Gaussian([[1.0]], 0.1), Gaussian([[1.0]], 0.2), 0.0)),
+    lambda: plant_of(bounds=Bounds(Box(0.0, 0.1) + Box(-0.1, 0.1), 0.0, 0.0)),
+    lambda: plant_of(PLAIN.with_delays([[1], [0]]), Limits(1.0, 1.0, [([1.0, 0.0], [2.0], -1.0, 1.0)])),
+    lambda: PLAIN.with_delays(outputs=0.5),
+    lambda: PLAIN.held(np.eye(2)),
+    lambda: Model.sampled(A, B, [[1.0]], 0.1),
     lambda: plant_of(bounds=Bounds(0.1, 0.1, Remainder(Ellipsoid(np.eye(1)), True, "an example"))),
     *wrong(truck_trailer, {"mass": [0.0], "stiffness": [-1.0], "damping": [-1.0], "dt": [0.0]}),
     lambda: replace(PLANT, limits=Limits([2.0, np.inf], 4.0, between_samples=8)),
     lambda: Model(0.9, 0.2, None, 60.0),
     lambda: plant_of(Model([[0.9]], [[0.2]], None, 60.0, ([19.0], [10.0]), [0.0])),
     lambda: plant_of(Model([[1.0]], [[0.2]], None, 60.0, ([20.0], [10.0]), [0.0])),
-    *(partial(linear_model, np.add, limits, BOUNDS, 1.0) for limits in (3, Limits((-1.0, np.inf), 1.0))),
-    *called(PLANT.to_deviation, [1.0]),
-    *called(PLANT.from_deviation, [1.0]),
-    partial(PLANT.to_deviation, [1.0, 1.0], "speed"),
-    partial(PLANT.from_deviation, [1.0, 1.0], "speed"),
+    *(
+        partial(linear_model, np.add, limits, BOUNDS, 1.0)
+        for limits in (3, Limits((-1.0, np.inf), 1.0), Limits(input=1.0), Limits((-1.0, 1.0), (0.0, 8.0)))
+    ),
     *called(
         Model.of,
         *(MODEL, SimpleNamespace(A=A, B=B, C=C, D=D, dt=True), (*MODEL, -0.1), SimpleNamespace(num=[1.0])),
-        *((A, B, C, np.ones((1, 1)), 0.1), (A, B, np.eye(3), D, 0.1), (A[:1], B, C, D, 0.1), (A, B), "plant"),
+        *((A, B, C, np.ones((1, 1)), 0.1), (A, B, np.eye(3), D, 0.1), (A[:1], B, C, D, 0.1), (A, B), "plant", A),
     ),
     partial(Model.of, (*MODEL, 0.1), 0.2),
     lambda: plant_of(SAMPLED.with_delays(1), Limits([1.0, 2.0], 3.0, between_samples=8)),

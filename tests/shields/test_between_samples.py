@@ -9,20 +9,18 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ncs_gym import Channel, ChannelContract, Packet, truck_trailer
+from ncs_gym import Channel, Packet, truck_trailer
 from ncs_gym.network.downlink import downlink_protocol
-from shields import Certificate, Infeasible, verify
+from shields import Certificate, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor
-from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.set_test import ellipsoid_test
 from shields.runtime.starts import starts_known
-from tests.certificates import certificate_of, feasible_age_not_sought
-from tests.plants import servo, swinging, with_radii
-from tests.product import altered, belief, library_plant, safe_loop, safety_filter, sampled_plant, synthesize
+from tests.certificates import certificate_of
+from tests.plants import swinging
+from tests.product import altered, belief, library_plant, safe_loop, safety_filter, sampled_plant
 from tests.second_verifier.verify import verify_again
-from tests.shields.runtime.batches import decided_alike
 from tests.verdicts import verified
 
 IDS = {"TruckTrailerCruise": 8, "BatchReactor": 4}
@@ -94,25 +92,6 @@ def test_no_state_between_samples_is_outside_and_without_it_some_are(name, kind,
     assert worst[None] > 1.0
 
 
-@pytest.mark.parametrize("kind", [1, 2])
-@pytest.mark.parametrize("mode", ["project", "lookahead"])
-def test_single_decisions_are_those_of_many(mode, kind):
-    loop = found("TruckTrailerCruise", 8)
-    plant, certificate = loop[0], loop[kind]
-    shield, rng = safety_filter(certificate, plant, mode=mode), np.random.default_rng(0)
-    shapes = np.tile(certificate.error_shapes[0], (300, 1, 1))
-    decided_alike(shield, rng.uniform(-2.0, 2.0, (300, 2)), shapes, rng.uniform(-4.0, 4.0, (300, 1)))
-
-
-def test_unshielded_cruise_leaves_its_box_between_two_samples_inside_it():
-    # The largest value between two samples in the box is about a tenth beyond it.
-    rng = np.random.default_rng(0)
-    x = np.concatenate([rng.uniform(-2.0, 2.0, (2, 200_000)), rng.choice([-4.0, 4.0], (1, 200_000))])
-    rows = fine_rows("TruckTrailerCruise")
-    inside = (np.abs(rows[-1] @ x) <= 1.0).all(axis=0)
-    assert 1.07 < np.abs(rows[::10] @ x[:, inside]).max() < 1.12
-
-
 def test_certificate_says_when_its_claim_holds_and_its_file_keeps_it(tmp_path):
     _, plain, wide = found("TruckTrailerCruise", 8)
     _, without, _ = found("TruckTrailerCruise")
@@ -121,29 +100,6 @@ def test_certificate_says_when_its_claim_holds_and_its_file_keeps_it(tmp_path):
     assert "between_samples" not in without.document["certificate"]
     wide.save(tmp_path / "wide.json")
     assert Certificate.load(tmp_path / "wide.json") == wide
-
-
-@pytest.mark.slow
-def test_plant_whose_disturbances_alone_fill_the_box_between_samples_has_no_certificate():
-    env = gym.make("ncs_gym/TruckTrailer-v0").unwrapped
-    plant = altered(env.plant, gamma=0.43)
-    synthesize(plant, safe_set="ellipsoid")
-    with feasible_age_not_sought(), pytest.raises(Infeasible, match="between"):
-        synthesize(altered(plant, between_samples=2))
-
-
-@pytest.mark.slow
-def test_quick_search_for_radii_knows_the_times_between_samples():
-    contract = ChannelContract(2)
-    plain, plant = (servo(1.0, dt=0.01, disturbance_bound=[0.0, 0.48], between_samples=points) for points in (None, 4))
-    synthesize(plain, contract=contract)
-    with pytest.raises(Infeasible, match="radii shrink to") as caught:
-        synthesize(plant, contract=contract)
-    share = caught.value.details["share_of_radii"]
-    assert 0.8 < share < 1.0
-    synthesize(with_radii(plant, 0.97 * share), contract=contract)
-    with pytest.raises(Infeasible):
-        synthesize(with_radii(plant, 1.05 * share), contract=contract)
 
 
 @pytest.mark.parametrize("horizon", [1, 4])
@@ -192,13 +148,6 @@ def test_before_the_first_decision_behind_a_downlink_times_between_samples_count
         if known:
             assert worst_between("BatchReactor", x[:, None], zero) <= 1.0
     assert min(counts.values()) > 10
-
-
-def test_plants_without_a_grid_have_no_rows_of_one():
-    plant = found("TruckTrailerCruise")[0]
-    test = rows_within_step(plant)
-    assert not len(test.state)
-    np.testing.assert_array_equal(test.at_samples, plant.box_rows)
 
 
 def test_at_all_times_assumes_that_disturbances_within_a_step_respect_its_bound():

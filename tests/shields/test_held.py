@@ -8,9 +8,8 @@ import pytest
 from scipy.linalg import null_space
 from scipy.optimize import linprog
 
-import shields
 from ncs_gym import ChannelContract
-from shields import Certificate, CertificateError, certificate_for, reach_of, setpoint_range
+from shields import CertificateError, certificate_for, reach_of, setpoint_range
 from shields.held import held_text
 from shields.runtime.rows_within_step import rows_within_step
 from tests.certificates import certificate_of
@@ -145,13 +144,6 @@ def test_older_samples_hold_less_and_ends_are_physical():
     assert "0 steps" not in held_text(certificate, plant, input_delay=1)
 
 
-def test_name_index_and_row_are_the_same_output():
-    plant, certificate = certified("delayed", "polytope")
-    ranges = [setpoint_range(certificate, plant, each) for each in ("x1", 0, [1.0, 0.0], [1.0, 0.0, 0.0])]
-    assert plant.past == 1
-    assert len({(each.low, each.high) for each in ranges}) == 1
-
-
 def test_nothing_is_held_where_an_estimate_may_be_farther_off_than_the_box_is_wide():
     plant = linear_plant(
         A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.3]], box=[1.0, 1.0], u_max=1.0, dt=0.1, disturbance_bound=0.01,
@@ -224,9 +216,3 @@ def test_both_refuse_what_they_cannot_use():
     ):
         with pytest.raises(ValueError, match=sentence):
             setpoint_range(certificate, plant, output, age)
-
-
-def test_both_are_public():
-    assert {"reach_of", "setpoint_range"} <= set(shields.__all__)
-    assert isinstance(setpoint_range(*reversed(certified("CSTR", "polytope")), 0), shields.held.SetPoints)
-    assert Certificate is shields.Certificate

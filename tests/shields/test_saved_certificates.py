@@ -7,11 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import LinearPlant
 from shields import Certificate, CertificateError, Infeasible
 from shields.polytope import MOST_MULTIPLIERS, MOST_ROWS, Polytope
 from shields.synthesis import invariant_polytope
-from tests.product import altered, linear_plant
 
 
 def with_polytope(certificate, rows, multipliers, seed=0):
@@ -48,27 +46,3 @@ def test_search_ends_with_no_more_rows_than_a_polytope_may_have(monkeypatch):
     faces = invariant_polytope.Faces(rows[:-1], -np.ones(20), np.ones(20))
     with pytest.raises(Infeasible, match="more than 20 rows"):
         invariant_polytope.invariant_faces(faces, predecessor, 2)
-
-
-sizes = st.floats(-75.0, 75.0).map(lambda power: 10.0**power) | st.sampled_from([1e-75, 1e-37, 1e37, np.inf])
-
-
-@settings(max_examples=80, deadline=None)
-@given(box=st.lists(sizes, min_size=2, max_size=2), u_max=sizes, bounds=st.lists(sizes, min_size=3, max_size=3))
-def test_every_plant_that_can_be_made_is_read_again(box, u_max, bounds, tmp_path_factory):
-    names = ("disturbance_bound", "sensor_bound", "initial_bound")
-    try:
-        plant = linear_plant(
-            A=[[0.5, 0.1], [0.0, 0.5]],
-            B=[[0.0], [1.0]],
-            box=box,
-            u_max=u_max,
-            dt=1.0,
-            **dict(zip(names, bounds, strict=True)),
-        )
-    except ValueError:
-        return
-    path = tmp_path_factory.mktemp("plant") / "plant.json"
-    plant.save(path)
-    assert LinearPlant.load(path).fingerprint == plant.fingerprint
-    assert altered(plant).fingerprint == plant.fingerprint

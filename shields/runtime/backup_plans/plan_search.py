@@ -410,7 +410,7 @@ def completed(
     flat = missing.reshape(steps, -1)
     some, every = np.any(flat, axis=1), np.all(flat, axis=1)
     turned, A, B = gains.swapaxes(1, 2), plant.A.T, plant.B.T
-    constants = np.array([fallback.with_gain(gain).constant for gain in gains])[:, None]
+    constants = np.array([fallback._replace(gain=gain).constant for gain in gains])[:, None]
     centers = np.repeat(estimates[None], number, axis=0)
     for j in range(steps):
         u = plans[j]

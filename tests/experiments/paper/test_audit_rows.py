@@ -11,7 +11,6 @@ from experiments.paper.audit import (
     Verdict,
     box_is_invariant,
     demonstration,
-    design,
     disturbance_set,
     equivalence,
     farthest_without_input,
@@ -25,7 +24,6 @@ from experiments.paper.paper_example import PaperExample
 from ncs_gym import BoxDisturbance, truck_trailer
 from shields.paper.bounds import PaperModel
 from shields.paper.optimization_problem import OptimizationProblem
-from shields.verification.rational_matrix import add, multiply, quadratic, rational, to_float, transpose
 
 CASE = PaperExample()
 
@@ -82,12 +80,6 @@ def test_printed_design_is_the_optimum_for_an_input_limit_of_six():
     assert np.abs(semidefinite_optimum(6.0, right**2 / epsilon_up) - CASE.K).max() > 3e-4
 
 
-def test_gain_that_is_the_optimum_at_the_printed_limit_would_hold():
-    L, K = optimum(CASE, 4.0)
-    claim = design(replace(CASE, K=K, M=np.linalg.inv(L)))
-    assert (claim.verdict, claim.defect) == (Verdict.HOLDS, "")
-
-
 def test_tail_at_delta_makes_op_feasible_and_the_printed_tail_does_not():
     plant, point = truck_trailer(), (0.9, 1.035)
     tail = -2.0 * np.log(0.95)  # the chi-square quantile of two degrees of freedom in closed form
@@ -101,7 +93,6 @@ def test_largest_error_is_undecided_exactly_between_the_two_readings():
     for largest in (2e-4, 0.0017, 0.0095):
         claim = simulated_error(replace(CASE, largest_error=largest))
         verdicts.append(claim.verdict)
-        assert bool(claim.defect) is (claim.verdict == Verdict.FAILS)
     assert verdicts == [Verdict.HOLDS, Verdict.UNDECIDED, Verdict.FAILS]
 
 
@@ -114,35 +105,10 @@ def test_reduced_gain_contracts_exactly_and_no_smaller_one_does():
     assert levels.max() == pytest.approx(1.0, abs=1e-9)
 
 
-def test_gain_and_step_that_the_row_about_the_margin_shows_are_those_it_confirms():
-    text = margin_at_one(CASE).computed
-    factor = float(text.split("With ")[1].split(" K")[0])
-    closed = CASE.A + factor * CASE.B @ CASE.K
-    assert contracts(closed, CASE.M)
-    x, d = (np.array([float(v) for v in text.split(f"{name} = [")[1].split("]")[0].split(",")]) for name in "xd")
-    (x, d), exact_M = (rational(x), rational(d)), rational(CASE.M)
-    assert (np.abs(to_float(d)) <= CASE.disturbance_half_widths).all()
-    assert quadratic(x, exact_M) <= 1 < quadratic(add(multiply(x, transpose(rational(closed))), d), exact_M)
-
-
 def test_margin_at_one_is_right_without_disturbance():
     assert margin_at_one(CASE).verdict == Verdict.FAILS
     claim = margin_at_one(replace(CASE, disturbance=BoxDisturbance((0.0, 0.0))))
-    assert (claim.verdict, claim.defect) == (Verdict.UNDECIDED, "")
-
-
-def test_only_if_example_by_sampling():
-    rng = np.random.default_rng(0)
-    M, closed = np.diag([1.0, 100.0]), np.diag([0.9, 0.0])
-    angles, kappa = rng.uniform(0.0, 2.0 * np.pi, (2, 50_000)), float(ONLY_IF.least_kappa)
-    states = np.stack([np.cos(angles[0]), np.sin(angles[0]) / 10.0])
-    push = 0.04 * np.stack([np.cos(angles[1]), np.sin(angles[1])])
-    following = closed @ states + push
-    assert (following * (M @ following)).sum(axis=0).max() <= 1.0
-    images = closed @ states
-    assert (images * (M @ images)).sum(axis=0).max() == pytest.approx(kappa, abs=1e-4)
-    inner = kappa**0.5 * states + push
-    assert (inner * (M @ inner)).sum(axis=0).max() > 1.0
+    assert claim.verdict == Verdict.UNDECIDED
 
 
 @pytest.mark.cases(1)
@@ -155,11 +121,6 @@ def test_only_if_verdict_follows_the_example(change, is_invariant, breaks_condit
     assert (example.is_invariant, example.breaks_condition) == (is_invariant, breaks_condition)
     expected = Verdict.FAILS if is_invariant and breaks_condition else Verdict.UNDECIDED
     assert equivalence(CASE, example).verdict == expected
-
-
-def test_witness_lies_where_every_kappa_reaches():
-    example = replace(ONLY_IF, witness=[[Fraction(0), Fraction(1, 10)]])  # z'Mz = 1, more than the least kappa
-    assert not example.breaks_condition
 
 
 def test_ball_and_box_are_compared_by_area():

@@ -38,14 +38,6 @@ def test_filter_is_the_textbook_filter_where_a_late_packet_is_current_or_discard
         np.testing.assert_allclose(ours.mean, textbook.x, atol=1e-12)
 
 
-def test_filter_corrects_only_the_episodes_in_which_a_packet_arrives():
-    ours = Definition1Filter(CASE, PLANT, np.ones((2, 2)), takes_late=True)
-    ours.advance(np.zeros((1, 2)), np.full((2, 2), 5.0), [(0, np.array([True, False]))])
-    predicted = (PLANT.A + PLANT.B @ CASE.K) @ np.ones(2)
-    np.testing.assert_allclose(ours.mean[:, 1], predicted)
-    assert np.abs(ours.mean[:, 0] - predicted).max() > 0.1
-
-
 def test_late_packets_taken_as_current_break_the_bound_and_the_replaying_filter_keeps_it():
     current, skipped, again = (largest_error(CASE, make) for make in (taken_as_current, discarded, replayed))
     assert current > 3.0 * CASE.epsilon

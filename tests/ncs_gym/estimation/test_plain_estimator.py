@@ -20,7 +20,6 @@ from ncs_gym.plants.batch_reactor import batch_reactor
 from tests import arrays
 from tests.fuzz import channels, examples, plants
 from tests.ncs_gym.estimation.plain_estimator import PlainEstimator
-from tests.plants import random_plant
 from tests.product import library_plant
 
 BURSTS = GilbertElliott(p_good_to_bad=0.15, p_bad_to_good=0.3, loss_good=0.05, loss_bad=0.9)
@@ -95,7 +94,7 @@ UNSTABLE = plants(most_states=3, radius=(0.9, 1.3), units=1.0), st.integers(0, 6
 
 
 @pytest.mark.cases(1)
-@pytest.mark.parametrize("count", [12, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [8, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("of", "age"), [STABLE, UNSTABLE], ids=["stable", "unstable"])
 def test_estimator_equals_the_plain_one_bit_for_bit(of, age, count):
     @given(plant=of, channel=channels(), age=age, seed=st.integers(0, 2**32 - 1))
@@ -114,10 +113,8 @@ def test_estimator_equals_the_plain_one_bit_for_bit(of, age, count):
 
 
 CASES = {
-    "case study": (truck_trailer(), Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2), None),
     "overtaking": (truck_trailer(mass=4000.0), Channel(loss=0.2, quantization_step=0.02, delay=1, jitter=4), None),
     "position only": (library_plant(truck_trailer, H=[[1.0, 0.0]]), Channel(loss=BURSTS, jitter=3), None),
-    "random outputs": (random_plant(6, 5, 3, p=2), Channel(loss=BURSTS, jitter=6), None),
     "cart-pole": (cart_pole(), Channel(loss=0.5, max_consecutive_losses=2, jitter=2), ChannelContract(4)),
     "broken": (batch_reactor(), Channel(loss=0.5, jitter=3), ChannelContract(3)),
     "one output": (cart_pole(full_state=False), Channel(loss=0.2, delay=1, jitter=1), ChannelContract(3)),

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid
-from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.set_membership import SetMembership
@@ -139,27 +138,6 @@ def test_an_update_that_keeps_the_error_or_takes_the_noise_alone_needs_the_infla
     assert inner.item() == pytest.approx(2.0 * INFLATION, rel=1e-10)
     room = sets.rounding_of_update(plant, 0)
     assert room >= plant.estimate_rounding if gain else room == plant.estimate_rounding
-
-
-def test_sets_that_are_found_have_the_room():
-    """Fine sensors and an unmeasured state: without it what an update leaves is as large as the set."""
-    for pole, gamma, sensor in ((0.9, 1e-16, 1e-10), (1.01, 1e-12, 1e-7), (0.9, 1e-12, 1e-6)):
-        plant = linear_plant(
-            A=[[1.02, 0.1], [0.0, pole]],
-            B=[[0.0], [1.0]],
-            H=[[1.0, 0.0]],
-            box=[1.0, 1.0],
-            u_max=1.0,
-            dt=0.1,
-            gamma=gamma,
-            sensor_bound=sensor,
-            initial_bound=0.0,
-        )
-        error_set = certified_error_set(plant, ChannelContract(2))
-        assert Estimator(plant, Channel(), error_set).error_set is error_set
-        outer, inner, _ = zip(*error_set.needs(plant)["(C2)"], strict=True)
-        for held, needed in zip(outer, inner, strict=True):
-            assert is_inside(needed, held)
 
 
 def sets_of_two_sensors_whose_noise_is_nearly_common():

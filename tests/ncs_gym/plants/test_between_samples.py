@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -79,16 +81,6 @@ def test_bound_that_is_out_of_reach_says_so():
             asked()
 
 
-def test_bound_is_no_larger_than_it_needs_to_be():
-    plant = altered(truck_trailer(mass=4000.0), between_samples=8)
-    # The worst second derivative at the beginning of a step, by hand: x2' of the first row, x2'' of the second.
-    stretch = (4.5 / 4.0 * 2.0 + 4.6 / 4.0 * 2.0 + 4.0) / 2.0
-    h = 0.5 / 8
-    assert h**2 / 8 * stretch <= plant.grid_rows.remainder[0] <= 1.2 * h**2 / 8 * stretch
-    finer = altered(plant, between_samples=32).grid_rows.remainder
-    assert (finer < plant.grid_rows.remainder / 12.0).all()
-
-
 def fine_values(plant, x, u, x_next):
     """Values of the rows at the grid points after the first, of a step from x to x_next, by scipy, (N, k)."""
     points = plant.between_samples
@@ -102,7 +94,7 @@ def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
     plant = altered(truck_trailer(mass=4000.0), between_samples=8)
     env = gym.make(CRUISE, plant=plant, disturbance="sphere")
     rng, between_alone, total = np.random.default_rng(0), 0, 0.0
-    for episode in range(12):
+    for episode in range(6):
         _, info = env.reset(seed=episode)
         np.testing.assert_array_equal(info["worst_constraint_values"], info["constraint_values"])
         for k in range(60):
@@ -118,28 +110,8 @@ def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
     assert between_alone  # the box was left between two samples that are inside
 
 
-def test_violation_between_samples_ends_an_episode_if_violations_do():
-    plant = altered(truck_trailer(mass=4000.0), between_samples=8)
-    env = gym.make(CRUISE, plant=plant, terminate_on_violation=True)
-    for seed in range(5):
-        env.reset(seed=seed)
-        terminated = False
-        for k in range(100):
-            *_, terminated, _, info = env.step(np.array([(-1.0) ** (k // 3)], np.float32))
-            assert terminated == (info["cost"] > 0.0)
-            if terminated:
-                break
-        assert terminated
-
-
-def test_without_the_setting_only_samples_count_and_everything_is_as_before():
-    plant = truck_trailer(mass=4000.0)
-    assert plant.between_samples is None
-    assert plant.grid_rows is None
-    assert plant.fingerprint == altered(plant, continuous_model=None).fingerprint
-
-
 def test_once_per_step_is_at_the_sampling_instants_alone():
+    assert truck_trailer().grid_rows is None
     plant = altered(truck_trailer(), between_samples=8)
     assert "by any time within a step" in " ".join(plant.assumptions)
     assert "at all times: at 8 of each step" in str(plant)
@@ -175,38 +147,22 @@ def held(**more):
 
 
 @pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
-@pytest.mark.parametrize("make", [pushed, held])
-def test_constant_disturbance_is_refused_beside_between_samples(make):
-    plant = make()
-    np.testing.assert_allclose(plant.step_offset, [0.0, 0.3])
-    document = plant.document
-    edited = document | {"limits": document["limits"] | {"between_samples": 8}}
-    for entrance in (lambda: altered(plant, between_samples=8), lambda: LinearPlant.load(edited)):
-        with pytest.raises(ValueError, match="rests without a constant disturbance"):
-            entrance()
-    assert make(between_samples=1).fingerprint == LinearPlant.load(document).fingerprint == plant.fingerprint
-
-
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
-def test_constant_disturbances_that_cancel_at_the_samples_do_not_within_a_step():
+def test_constant_disturbance_is_refused_beside_between_samples_also_where_two_cancel_at_the_samples():
+    both = {"disturbance_bound": ([[0.0, 0.0], [0.6, -0.6]], [0.0, 0.0], [1.0, 1.0])}
     cancel = {"disturbance_bound": ([[0.0], [0.6]], [-1.0], [0.0])}
-    both = ([[0.0, 0.0], [0.6, -0.6]], [0.0, 0.0], [1.0, 1.0])
-    for plant in (held(**cancel), pushed(disturbance_bound=both)):
-        assert plant.step_offset[1] > 0.5
-        with pytest.raises(ValueError, match="rests without a constant disturbance"):
-            altered(plant, between_samples=8)
+    for plant in (pushed(), held(), pushed(**both), held(**cancel)):
+        assert plant.step_offset[1] > 0.29
+        document = plant.document
+        edited = document | {"limits": document["limits"] | {"between_samples": 8}}
+        for entrance in (lambda plant=plant: altered(plant, between_samples=8), partial(LinearPlant.load, edited)):
+            with pytest.raises(ValueError, match=r"without .* constant disturbance"):
+                entrance()
+        assert LinearPlant.load(document).fingerprint == plant.fingerprint
 
 
 def test_model_in_continuous_time_is_the_one_that_was_sampled():
     plant = truck_trailer()
     for change in ({"A": 0.9 * plant.A}, {"dt": 1.0}, {"continuous_model": 1.1 * plant.continuous_model}):
-        with pytest.raises(ValueError, match="is not the one that A and B were sampled from"):
+        with pytest.raises(ValueError, match="what A and B were sampled from"):
             altered(plant, **change)
     assert altered(plant, A=0.9 * plant.A, continuous_model=None).continuous_model is None
-    small = sampled_plant(  # a state in units in which its limit is tiny
-        ([[0.0, 1e9], [0.0, -1.0]], [[0.0], [1e-9]], np.eye(2), np.zeros((2, 1))),
-        dt=0.1, box=[1e9, 1.0], u_max=1e9, disturbance_bound=0.0, sensor_bound=0.01, initial_bound=0.01,
-    )  # fmt: skip
-    wrong = small.A * [[1.0, 1.0], [1.0, 0.95]]
-    with pytest.raises(ValueError, match="is not the one that A and B were sampled from"):
-        altered(small, A=wrong)

@@ -3,10 +3,13 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from scipy.stats import chi2
 
 from ncs_gym import truck_trailer
+from ncs_gym.plants.convoy import convoy
+from ncs_gym.plants.lane_keeping import lane_keeping
+from ncs_gym.plants.stirred_tank import stirred_tank
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from tests.product import altered, library_plant
 
@@ -19,17 +22,6 @@ def test_truck_trailer_reproduces_the_printed_matrices():
     np.testing.assert_allclose(plant.B, [[0.0612], [0.1636]], atol=5e-5)
 
 
-def test_zero_order_hold_agrees_with_integrating_the_differential_equation():
-    plant = truck_trailer(mass=3000.0, stiffness=4000.0, damping=900.0, dt=0.7)
-
-    def rate(_, x):
-        return [x[1], -4000.0 / 3000.0 * x[0] - 900.0 / 3000.0 * x[1] + 1.7]
-
-    start = np.array([0.4, -0.9])
-    end = solve_ivp(rate, (0.0, 0.7), start, rtol=1e-11, atol=1e-12).y[:, -1]
-    np.testing.assert_allclose(plant.A @ start + plant.B @ [1.7], end, atol=1e-8)
-
-
 def test_disturbance_bound_holds_ball_plus_truncated_noise():
     plant = truck_trailer()
     rng = np.random.default_rng(0)
@@ -38,12 +30,6 @@ def test_disturbance_bound_holds_ball_plus_truncated_noise():
         direction /= np.linalg.norm(direction)
         need = np.sqrt(plant.gamma) + np.sqrt(chi2.ppf(0.95, 2) * direction @ plant.process_noise_cov @ direction)
         assert plant.disturbance.support(direction) >= need
-
-
-def test_case_study_bounds_have_the_measured_radii():
-    plant = truck_trailer()
-    assert np.sqrt(plant.disturbance.shape_matrix[0, 0]) == pytest.approx(0.0468, abs=5e-5)
-    assert plant.initial_error.shape_matrix[0, 0] == pytest.approx(1e-4 * 5.9915, rel=1e-4)
 
 
 def test_sensor_bound_with_quantizer_holds_corners_of_the_rounding_box():
@@ -109,3 +95,21 @@ def test_fingerprint_changes_with_every_number():
     zero = {"operating_state": [0.0, 0.0], "between_samples": 1} | dict.fromkeys(BOUNDS, 0.0)
     for same in (truck_trailer(), altered(base), altered(base, A=base.A), altered(base, **zero)):
         assert same.fingerprint == base.fingerprint
+
+
+def test_tank_runs_away_at_the_rate_of_its_unstable_pole():
+    growth = max(abs(np.linalg.eigvals(stirred_tank().A)))
+    assert np.log(growth) * 60.0 / 3.0 == pytest.approx(2.83, abs=0.01)  # per minute, of a step of 3 s
+
+
+def test_follower_falls_back_by_what_the_leader_gains():
+    plant, v = convoy(), np.array([0.0, 1.0])
+    away = expm(np.array([[0.0, -1.0], [0.0, -1.0 / 0.3]]) * 0.1) @ v
+    np.testing.assert_allclose(plant.A @ v, away, rtol=1e-12)
+    assert np.sqrt(plant.disturbance_bound.shape_matrix[0, 0]) == pytest.approx(0.45 * 0.1)
+
+
+def test_car_moves_sideways_with_its_heading():
+    plant = lane_keeping()
+    np.testing.assert_allclose(plant.A, [[1.0, 20.0 * 0.05], [0.0, 1.0]], rtol=1e-12)
+    np.testing.assert_allclose(plant.B, [[20.0 * 0.05**2 / 2.0], [0.05]], rtol=1e-12)

@@ -46,11 +46,6 @@ def test_short_form_has_no_numbers():
     assert repr(plant) == f"<LinearPlant: 2 states, 1 input, 2 outputs, fingerprint {plant.fingerprint[:16]}>"
 
 
-def test_text_leaves_out_past_inputs():
-    delayed_by_two = linear_plant(**STABLE, box=1.0, u_max=1.0, input_delay=2, input_names=("valve",))
-    assert " ago" not in str(delayed_by_two)
-
-
 def test_the_unit_1_is_no_unit():
     valve = linear_plant(**STABLE, box=1.0, input_limits=(0.0, 1.0), operating_input=[0.5], operating_state=[0.0, 0.0])
     described = str(altered(valve, state_units=["1", "m"], input_units=("1",), input_names=("valve",)))

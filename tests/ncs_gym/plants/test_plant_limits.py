@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_gym.limits import ChosenLimitsWarning
-from tests.product import altered, linear_plant
+from tests.product import linear_plant
 
 QUIET = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
 MODEL = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.5]], "u_max": 1.0, "dt": 0.1} | QUIET
@@ -29,13 +29,10 @@ def test_limits_around_an_operating_point_keep_both_ends():
     np.testing.assert_allclose(plant.box_ends.T / plant.box, [[-2.0, 5.0]])
     np.testing.assert_allclose(1.0 / plant.box, [[3.5]])
     np.testing.assert_allclose(plant.input_ends, [[-10.0], [2.0]])
-    np.testing.assert_allclose(plant.to_deviation([21.5]), [1.5])
-    np.testing.assert_allclose(plant.from_deviation([-2.0]), [18.0])
-    np.testing.assert_allclose(plant.from_deviation([2.0], "input"), [12.0])
-    np.testing.assert_allclose(plant.to_deviation([0.0], "input"), [-10.0])
+    np.testing.assert_array_equal([*plant.operating_state, *plant.operating_input], [20.0, 10.0])
     assert not plant.is_symmetric
     for name in ("box_rows", "u_max"):
-        with pytest.raises(ValueError, match="the limits of this plant are not"):
+        with pytest.raises(ValueError, match="this needs limits"):
             getattr(plant, name)
 
 
@@ -70,14 +67,6 @@ def test_a_number_stands_for_a_vector_of_one_entry():
     limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
     plant = linear_plant(**ROOM | {"operating_state": 20.0, "operating_input": 10.0}, **limits)
     assert plant.fingerprint == linear_plant(**ROOM, **limits).fingerprint
-    np.testing.assert_allclose(plant.to_deviation(21.5, "output"), [1.5])
-    np.testing.assert_allclose(plant.from_deviation(2.0, "input"), [12.0])
-
-
-def test_output_is_converted_by_the_output_matrix():
-    plant = altered(linear_plant(**ROOM, state_limits=(18, 25), input_limits=(0, 12)), H=[[2.0]])
-    np.testing.assert_allclose(plant.to_deviation([41.0], "output"), [1.0])
-    np.testing.assert_allclose(plant.from_deviation([1.0], "output"), [41.0])
 
 
 def test_own_limits_are_the_closest_of_each_state_alone():
@@ -106,26 +95,3 @@ def test_state_without_a_limit_has_the_size_that_its_own_units_and_inputs_give_i
     units = np.array([1.0, 1e6])
     in_micrometers = linear_plant(A=A * units[:, None] / units, B=B * units[:, None], box=[1.0, np.inf], **settings)
     np.testing.assert_allclose(in_micrometers.half_widths, in_meters.half_widths * units, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "limits",
-    [
-        {"input_limits": (0.0, 5.0), "operating_input": [0.0]},
-        {"input_limits": (0.0, 5.0)},
-        {"input_limits": (-1.0, 5.0), "operating_state": [0.0], "state_limits": (0.0, 1.0)},
-    ],
-)
-def test_nothing_rests_at_an_end_of_its_limits(limits):
-    model = {"A": [[0.9]], "B": [[0.1]], "dt": 1.0, "sensor_bound": 0.0, "initial_bound": 0.0, "disturbance_bound": 0.0}
-    with pytest.raises(ValueError, match=r"at=\(state, input\) of the Model, strictly between"):
-        linear_plant(**model | ({} if "state_limits" in limits else {"box": 1.0}) | limits)
-
-
-def test_disturbance_may_act_in_some_directions_alone():
-    model = {"A": 0.9 * np.eye(2), "B": np.ones((2, 1)), "dt": 1.0, "box": 1.0, "u_max": 1.0}
-    some = linear_plant(
-        **model, disturbance_bound=(np.eye(2), [-0.0, -0.1], [0.0, 0.1]), sensor_bound=0.0, initial_bound=0.0
-    )
-    own = linear_plant(**model, disturbance_bound=[0.0, 0.1], sensor_bound=0.0, initial_bound=0.0)
-    assert some.fingerprint == own.fingerprint

@@ -90,14 +90,6 @@ def test_change_of_the_input_has_its_price_and_the_last_input_is_observed(plant)
     )
 
 
-def test_farthest_equilibrium_is_where_full_throttle_holds_the_coupling():
-    plant = truck_trailer()
-    farthest = farthest_equilibrium(plant, np.array([1.0, 0.0]))
-    assert farthest == pytest.approx(1000.0 * 4.0 / 4500.0)  # the coupling's pull at full throttle
-    assert setpoints(reach=farthest).check(plant) == ""
-    assert farthest_equilibrium(plant, np.array([0.0, 1.0])) == pytest.approx(0.0, abs=1e-9)
-
-
 def test_farthest_equilibrium_is_that_of_a_search_over_all_inputs():
     rng = np.random.default_rng(3)
     for _ in range(5):
@@ -283,3 +275,28 @@ def test_what_a_disturbance_stores_in_itself_is_refused_where_environments_share
     envs.reset(seed=0)
     with pytest.raises(ValueError, match="Drifting stores 'at' in itself, which all environments of a vector share"):
         envs.step(np.ones((3, 1), np.float32))
+
+
+class Restless(Regulation):
+    """Draws more than the task that it is made of."""
+
+    def begin(self, rng, plant, size=None):
+        rng.random(7)
+        return super().begin(rng, plant, size)
+
+    def advance(self, rng, plant, task_state, u):
+        rng.random(3)
+        return super().advance(rng, plant, task_state, u)
+
+
+@pytest.mark.parametrize("make", [gym.make, gym.make_vec])
+def test_loop_is_the_same_whatever_a_task_draws(make):
+    seen = []
+    for task in (None, Restless()):
+        env = make("ncs_gym/TruckTrailerCruise-v0", task=task)
+        infos = [env.reset(seed=5)[1]] + [env.step(np.zeros(env.action_space.shape))[4] for _ in range(30)]
+        infos.append(env.reset()[1])
+        seen.append(
+            [np.concatenate([np.ravel(info[key]) for key in ("state", "estimate", "packets")]) for info in infos]
+        )
+    np.testing.assert_array_equal(*seen)

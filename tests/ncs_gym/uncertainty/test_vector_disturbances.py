@@ -15,7 +15,6 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.plants.resting_point import MovedOperatingPointWarning
-from ncs_gym.uncertainty.disturbances import BallDisturbance, SphereDisturbance
 from tests.product import library_plant, linear_plant, loop_env, vector_env
 
 IN_M = AdversarialDisturbance(np.array([[2.0, 0.3], [0.3, 1.0]]))
@@ -30,20 +29,6 @@ def test_batched_draws_equal_scalar_ones(source):
     for i in range(30):
         one = source.draw(rng, plant, nominal[:, i], int(steps[i]), memory[:, i])
         np.testing.assert_allclose(drawn[:, i], one, atol=1e-7)
-
-
-@pytest.mark.slow
-def test_batched_draws_are_distributed_like_scalar_ones():
-    plant, rng = truck_trailer(), np.random.default_rng(0)
-    pairs = [(source.draw, source.draw_many) for source in (BallDisturbance(), BoxDisturbance(), SphereDisturbance())]
-    for draw, draw_many in pairs:
-        many = draw_many(rng, plant, np.zeros((2, 20000)), np.zeros(20000), None).T
-        few = np.array([draw(rng, plant, np.zeros(2), 0, None) for _ in range(5000)])
-        np.testing.assert_allclose(np.cov(many.T), np.cov(few.T), atol=0.05 * np.trace(np.cov(few.T)))
-    for noise in (plant.process_noise, plant.sensor_noise):
-        many, few = noise.sample(rng, 20000), np.array([noise.sample(rng) for _ in range(5000)])
-        assert noise.bound.gauge(many).max() <= 1.0 + 1e-12
-        np.testing.assert_allclose(np.cov(many.T), np.cov(few.T), atol=0.05 * np.trace(np.cov(few.T)))
 
 
 def test_a_disturbance_beyond_its_bound_raises():

@@ -47,12 +47,8 @@ def test_no_ascent_over_state_error_and_disturbance_leaves_the_safe_set_under_th
     shield, rng = safety_filter(certificate, plant), np.random.default_rng(0)
     closed, gain = plant.A + plant.B @ certificate.K, plant.B @ certificate.K
     safe, errors, M = certificate.safe_set, certificate.error_set, certificate.M
-    shares = certificate.multipliers
-    reach = (
-        closed @ certificate.L @ closed.T / shares.state
-        + gain @ certificate.Sigma @ gain.T / shares.estimate
-        + certificate.D / shares.disturbance
-    )
+    lx, le, ld = certificate.proofs[-1].shares
+    reach = closed @ certificate.L @ closed.T / lx + gain @ certificate.Sigma @ gain.T / le + certificate.D / ld
     worst, bound = 0.0, np.sqrt(np.linalg.eigvals(M @ reach).real.max())
     for _ in range(60):
         slope = rng.standard_normal(plant.n)

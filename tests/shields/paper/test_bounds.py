@@ -9,43 +9,15 @@ from tests.product import library_plant
 Q, P0 = np.diag([1e-4, 3e-5]), np.diag([2e-4, 1e-4])
 
 
-def covariance_bound(k, p0, g2, q_bar):
-    """p_bar_k of Theorem 1."""
-    return p0 * g2**k + q_bar * sum(g2**i for i in range(k))
-
-
 def uplink(gamma, Q, P0, delta, g2):
     """eps_up of Theorem 2 from the numbers of a plant."""
     largest = np.linalg.eigvalsh(P0)[-1], np.linalg.eigvalsh(Q)[-1] + gamma
     return uplink_error_bound(*largest, chi2.ppf(1.0 - delta, len(Q)), g2, 1.0 - g2)
 
 
-def test_covariance_bound_is_the_recursion_p_plus_is_g2_p_plus_q():
-    p = 2e-4
-    for k in range(30):
-        assert covariance_bound(k, 2e-4, 0.8, 6e-4) == pytest.approx(p)
-        p = 0.8 * p + 6e-4
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_covariance_bound_bounds_a_covariance_that_is_only_predicted(seed):
-    rng = np.random.default_rng(seed)
-    G = rng.standard_normal((2, 2))
-    G *= 0.9 / np.linalg.norm(G, 2)
-    P, q_bar = P0, np.linalg.eigvalsh(Q)[-1] + 5e-4
-    for k in range(40):
-        assert np.linalg.eigvalsh(P)[-1] <= covariance_bound(k, 2e-4, 0.81, q_bar) * (1 + 1e-12)
-        P = G @ P @ G.T + Q + 5e-4 * np.eye(2)
-
-
 def test_uplink_bound_is_theorem_5_with_the_kept_quantile():
     expected = (2e-4 * 0.9 + (1e-4 + 5e-4) / 0.1) * chi2.ppf(0.95, 2)
     assert uplink(5e-4, Q, P0, 0.05, 0.9) == pytest.approx(expected)
-
-
-def test_uplink_bound_is_the_limit_of_the_recursion_times_the_quantile():
-    far = covariance_bound(3000, 0.0, 0.9, 6e-4) * chi2.ppf(0.95, 2)
-    assert uplink(5e-4, Q, np.zeros((2, 2)), 0.05, 0.9) == pytest.approx(far)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import linprog
 
 from shields.synthesis.faces import Extremes, Faces, multipliers_of
+from tests.product import linear_plant, synthesize
 
 
 def faces_of(rng, r, n, *, symmetric=False, some_open=True):
@@ -84,3 +85,14 @@ def test_numbers_out_of_reach_are_refused(number):
     within = Extremes(Faces(np.eye(2), -np.ones(2), np.ones(2)))
     with pytest.raises(ArithmeticError, match="numbers from 1e\\+15 on"):
         within.of(rows[0])
+
+
+def test_solvers_print_nothing(capfd):
+    faces = Faces(np.eye(2), -np.ones(2), np.ones(2))
+    assert Extremes(faces).of(np.array([1.0, 2.0])) == (-3.0, 3.0)
+    plant = linear_plant(
+        A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.3]], dt=0.1, box=[1.0, 2.0], u_max=3.0,
+        disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
+    )  # fmt: skip
+    assert synthesize(plant, safe_set="polytope").polytope is not None
+    assert capfd.readouterr() == ("", "")

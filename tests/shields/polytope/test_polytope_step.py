@@ -15,8 +15,7 @@ from shields.runtime.projection import closest_between
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.starts import starts_inside
 from tests.certificates import certificate_of
-from tests.plants import random_plant
-from tests.product import altered, linear_plant, safety_filter
+from tests.product import linear_plant, safety_filter
 from tests.shields.runtime.batches import decided_alike
 
 ALL = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleTwoWay")
@@ -50,20 +49,6 @@ def test_closest_points_do_not_depend_on_units_and_bear_many_rows(unit):
         normals = effect[active] * np.sign(values[active, k])[:, None]
         assert active.any()
         assert nnls(normals.T, (wanted - found)[:, k])[1] < 1e-6
-
-
-def test_rows_given_twice_or_with_both_signs_change_no_projection():
-    plant = altered(random_plant(2, 2, 2, gamma=1e-4), u_max=2.0)
-    estimates, shape, proposals = situations(safety_filter(certificate_of(plant, safe_set="polytope"), plant), 200)
-    results = []
-    for box in (plant.box_rows, np.concatenate([plant.box_rows, -plant.box_rows, plant.box_rows])):
-        twice = altered(plant, box=box)
-        shield = safety_filter(certificate_of(twice, safe_set="polytope"), twice)
-        decisions = [shield.decide(x, shape, u) for x, u in zip(estimates, proposals, strict=True)]
-        results.append((np.array([each.input for each in decisions]), [each.reason for each in decisions]))
-    assert results[0][1] == results[1][1]
-    assert results[0][1].count("projected") > 50
-    np.testing.assert_allclose(results[0][0], results[1][0], atol=1e-5)
 
 
 def test_parallel_rows_do_not_hide_the_closest_point():

@@ -14,15 +14,11 @@ from experiments.commands.synthesize import synthesize as run_command
 from ncs_gym import ChannelContract
 from shields import Infeasible, verify
 from shields.synthesis import ellipsoid_certificates, invariant_polytope, search
-from tests.certificates import feasible_age_not_sought
+from shields.synthesis.design_problem import design_problem
+from shields.synthesis.invariant_set_program import InvariantSetProgram
+from tests.plants import random_plant
 from tests.product import linear_plant, synthesize
 from tests.verdicts import verified
-
-# A plant that is refused under its contract, and certified for less age.
-AGED = linear_plant(
-    A=[[2.0, 0.1], [0.1, 1.0]], B=[[0.0], [0.1]], dt=0.1, box=[0.3, 1.0], u_max=5.0, disturbance_bound=1e-5,
-    sensor_bound=1e-3, initial_bound=(np.eye(2), [1e-3, 1e-3]),
-)  # fmt: skip
 
 
 class Processor:
@@ -46,7 +42,7 @@ def test_set_that_fails_the_exact_check_is_not_sought_again_and_a_polytope_is(lo
     assert not found.keeps_ellipsoid
     assert sum(line.startswith("initial design") for line in lines) == 1
     assert verified(found, loaded).valid
-    with feasible_age_not_sought(), pytest.raises(Infeasible, match=r"but in exact arithmetic .* fails by"):
+    with pytest.raises(Infeasible, match=r"but in exact arithmetic .* fails by"):
         synthesize(loaded, safe_set="ellipsoid")
 
 
@@ -66,18 +62,9 @@ def test_few_gains_whose_polytopes_have_too_many_rows_end_the_search(monkeypatch
     )  # fmt: skip
     monkeypatch.setattr(invariant_polytope, "MOST_ROWS", 3)
     lines = []
-    with feasible_age_not_sought(), pytest.raises(Infeasible, match="more than 3 rows"):
+    with pytest.raises(Infeasible, match="more than 3 rows"):
         synthesize(plant, contract=ChannelContract(1), progress=lines.append)
     assert sum("more than 3 rows" in line for line in lines) == 5 * len(invariant_polytope.MARGINS)
-
-
-def test_without_a_time_limit_a_slow_processor_says_the_same_age_which_has_a_certificate(monkeypatch):
-    monkeypatch.setattr(search.time, "thread_time", Processor(1e6))
-    with pytest.raises(Infeasible, match=r"promise less age.*there is a certificate for max_age = \d+ ") as told:
-        synthesize(AGED, contract=ChannelContract(400))
-    age = told.value.details["max_age"]
-    assert f"max_age = {age} (asked: max_age = 400)" in str(told.value)
-    assert verified(synthesize(AGED, contract=ChannelContract(age)), AGED).valid
 
 
 def test_best_certificate_in_time_is_verified_and_says_that_the_time_was_over(loaded, monkeypatch):
@@ -99,3 +86,26 @@ def test_command_ends_after_a_minute_of_work(loaded, monkeypatch, tmp_path, caps
 def test_time_limit_that_is_none_is_refused(loaded, limit):
     with pytest.raises(ValueError, match="time_limit must be"):
         synthesize(loaded, time_limit=limit)
+
+
+def test_every_stage_says_what_is_sought_and_the_volume_reached(loaded):
+    lines = []
+    certificate = synthesize(loaded, safe_set="ellipsoid", progress=lines.append)
+    assert lines[:2] == ["gains, and what they bear", "error set"]
+    assert lines[2].startswith("initial design: ")
+    assert any(line.startswith("alternation 1 of at most 40: ") for line in lines)
+    volume = certificate.provenance["volume_of_box_ellipsoid"]
+    assert lines[-1] == f"exact verification: {volume:.4f} of the box ellipsoid's volume"
+
+
+def test_solution_of_the_program_meets_the_conditions():
+    problem, _ = design_problem(random_plant(1, 4, 2))
+    multipliers, inputs = (0.85, 0.045, 0.105), np.array([0.8, 0.7])
+    design = InvariantSetProgram(problem, 1e-6).solve(multipliers, inputs, np.eye(4))
+    (lx, le, ld), L, K, Sigma = multipliers, design.L, design.K, problem.error_shapes[0]
+    closed, BK = problem.A + problem.B @ K, problem.B @ K
+    rest = L - closed @ L @ closed.T / lx - BK @ Sigma @ BK.T / le - problem.D_u / ld
+    assert np.linalg.eigvalsh(rest)[0] > -1e-7
+    used = np.einsum("ij,jk,ik->i", K, L, K) / inputs + np.einsum("ij,jk,ik->i", K, Sigma, K) / (1.0 - inputs)
+    assert used.max() <= 1.0
+    assert (np.einsum("ij,jk,ik->i", problem.C, L, problem.C) <= 1.0).all()

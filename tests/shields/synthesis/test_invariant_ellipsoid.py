@@ -5,11 +5,9 @@ from scipy.linalg import solve_discrete_lyapunov
 from ncs_gym import ChannelContract, cart_pole, truck_trailer
 from ncs_gym.plants.batch_reactor import batch_reactor
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Infeasible
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.tolerance import invariant_ellipsoid, most_tolerated, regulators
-from tests.certificates import feasible_age_not_sought
 from tests.plants import random_plant
 from tests.product import altered, library_plant, linear_plant, synthesize
 from tests.verdicts import verified
@@ -36,9 +34,9 @@ def test_its_margin_is_what_exact_verification_accepts(make):
     margin = most_tolerated(plant, contract, polytope=False).margin
     tolerated = radii_scaled(plant, 0.99 * margin)
     assert verified(synthesize(tolerated, contract=contract, safe_set="ellipsoid"), tolerated).valid
-    with feasible_age_not_sought(), pytest.raises(Infeasible, match="radii shrink to") as caught:
+    with pytest.raises(Infeasible, match="radii shrink to") as caught:
         synthesize(radii_scaled(plant, 2.0 * margin), contract=contract, safe_set="ellipsoid")
-    assert caught.value.details["share_of_radii"] == pytest.approx(0.5, rel=1e-2)
+    assert caught.value.shortfall == pytest.approx(0.5, rel=1e-2)
 
 
 def test_its_set_is_the_smallest_that_is_invariant_with_its_gain():
@@ -84,17 +82,6 @@ PENDULUM = {"A": [[1.1, 0.1], [0.1, 1.0]], "B": [[0.0], [0.1]], "box": [0.3, 1.0
 SMALL = {"disturbance_bound": [1e-4, 1e-3], "sensor_bound": 1e-3, "initial_bound": (np.eye(2), [1e-3, 1e-3])}
 
 
-@pytest.mark.slow
-def test_age_that_is_named_is_nearly_the_largest_that_synthesis_accepts():
-    bounds = {"gamma": 1e-7, "process_noise_cov": 1e-8 * np.eye(2), "sensor_bound": 1e-3, "initial_bound": 1e-3}
-    plant = linear_plant(**PENDULUM | bounds)
-    with pytest.raises(Infeasible, match="there is a certificate for max_age = ") as caught:
-        synthesize(plant, contract=ChannelContract(40, 1e-3), safe_set="ellipsoid")
-    age = caught.value.details["max_age"]
-    assert most_tolerated(plant, ChannelContract(age, 1e-3), polytope=False).margin >= 1.0
-    assert most_tolerated(plant, ChannelContract(age + 1, 1e-3), polytope=False).margin < 1.0 + 1e-4
-
-
 def test_disturbance_that_exceeds_a_limit_alone_is_named():
     plant = library_plant(
         truck_trailer, gamma=0.0, disturbance_bound=2.0, process_noise_cov=np.zeros((2, 2)), sensor_bound=0.01
@@ -109,7 +96,7 @@ def test_plant_that_no_gain_stabilizes_is_not_blamed_on_its_bounds():
     told = "no gain stabilizes the plant: no input moves x1, which does not decay by itself"
     with pytest.raises(Infeasible, match=told) as caught:
         synthesize(plant, contract=ChannelContract(0))
-    assert caught.value.details == {"share_of_radii": 0.0}
+    assert caught.value.shortfall == 1.0
 
 
 def test_regulator_decays_as_fast_as_asked_for():
@@ -118,17 +105,3 @@ def test_regulator_decays_as_fast_as_asked_for():
         gain = regulator_gain(plant.A, plant.B, 1.0, decay)
         assert np.abs(np.linalg.eigvals(plant.A + plant.B @ gain)).max() < np.sqrt(decay)
     assert regulator_gain(plant.A, np.zeros_like(plant.B), 1.0, 1.0) is None
-
-
-@pytest.mark.parametrize(("full_state", "age", "radius"), [(True, 1, 6.3e-3), (True, 4, 5e-3), (False, 1, 1.9e-3)])
-def test_cart_pole_tolerates_at_least_the_measured_radii(full_state, age, radius):
-    plant = cart_pole(full_state=full_state)
-    half_widths, n = plant.half_widths, plant.n
-    plant = altered(
-        plant,
-        process_noise_cov=np.diag((radius * half_widths) ** 2) / truncation_energy(0.05, n),
-        measurement_noise_cov=np.diag((0.01 * radius * plant.H @ half_widths) ** 2) / truncation_energy(0.05, plant.p),
-        initial_cov=(0.01 * radius * half_widths.min()) ** 2 / truncation_energy(0.05, n) * np.eye(n),
-    )
-    # Exact verification accepts 0.99 times the radii that a margin allows: shown above.
-    assert most_tolerated(plant, ChannelContract(age), polytope=True).margin > 1.0 / 0.99

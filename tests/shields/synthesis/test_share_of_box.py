@@ -52,17 +52,6 @@ def test_unbounded_box_has_no_share():
     assert share_of_box(plant, np.diag([1.0, 5.0])) == {}
 
 
-def test_share_of_the_ellipsoid_is_not_said_to_be_that_of_the_polytope():
-    """States have no limits of their own: no points are drawn in between them."""
-    plant = linear_plant(
-        A=[[0.9, 0.2], [-0.1, 0.9]], B=[[0.0], [0.3]], dt=0.1, box=[[1.0, 0.5], [-0.5, 1.0]], u_max=1.0,
-        disturbance_bound=0.02, sensor_bound=0.01, initial_bound=0.02,
-    )  # fmt: skip
-    certificate = synthesize(plant)
-    share = 100.0 * certificate.provenance["share_of_box"]
-    assert f"% of |-0.5 x1 + x2| <= 1; the ellipsoid {share:.4g} % of the safe box's volume" in size_of(certificate)
-
-
 def test_share_of_a_polytope_is_of_what_further_limits_leave_of_the_box():
     limit = [1.0, 1.0], -1.1, 1.0
     plant = linear_plant(

@@ -25,7 +25,6 @@ from tests.shields.verification.test_mutations import replaced, with_multipliers
 from tests.shields.verification.test_rational_matrix import minors_say_semidefinite
 from tests.verdicts import verified
 
-ROOT = Path(__file__).resolve().parents[3]
 # The record of a verdict, and what a certificate and a plant consist of.
 MAY_IMPORT = {
     "ncs_gym",
