@@ -73,7 +73,7 @@ test-slow: $(INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks,
 
 # What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit, the study and a record as the
 # pages have them, hints, the same bits in every process, and what worker processes do.
-SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_audit.py tests/test_suite.py \
+SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_paper.py tests/test_suite.py \
 	tests/experiments/commands/test_requirements.py \
 	tests/test_published_plants.py \
 	tests/shields/synthesis/test_hints.py::test_a_contract_is_named_where_a_stable_plant_has_none \

@@ -12,12 +12,11 @@ from agents.agent_file import AgentError, pretrained_folder
 from agents.evaluation import evaluate
 from agents.hyperparams import tuned_hyperparams, tuned_steps
 from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
-from agents.results import Episode, Evaluation, TrainingPoint, TrainingStopped
+from agents.results import Episode, Evaluation, TrainingPoint
 from ncs_gym.installation import install_command
 
 if TYPE_CHECKING:
     from agents.agent import Agent, pretrained
-    from agents.algorithms import AppliedActionBuffer
     from agents.callbacks import DualAscentCallback, SafetyCallback
     from agents.sb3_vec_env import SB3VecEnv
     from agents.training import TrainingResult, train, untrained
@@ -27,7 +26,6 @@ __distribution__ = "ncs-gym"
 __all__ = [
     "Agent",
     "AgentError",
-    "AppliedActionBuffer",
     "DualAscentCallback",
     "Episode",
     "Evaluation",
@@ -38,7 +36,6 @@ __all__ = [
     "ShieldSettings",
     "TrainingPoint",
     "TrainingResult",
-    "TrainingStopped",
     "evaluate",
     "pretrained",
     "pretrained_folder",
@@ -50,16 +47,11 @@ __all__ = [
 
 
 def __dir__() -> list[str]:
-    """Returns the public names, some of which need not be imported yet."""
     return __all__
 
 
 def __getattr__(name: str) -> Any:
-    """Imports what needs the extra `train` when it is first asked for.
-
-    Raises:
-        ModuleNotFoundError: If a package of the extra is missing; it says what to type.
-    """
+    """Imports what needs the extra `train`; raises ModuleNotFoundError with what to type if it is not installed."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:

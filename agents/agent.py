@@ -5,12 +5,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import platform
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +16,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.agent_file import AgentError, pretrained_folder, read_files
+from agents.agent_file import AgentError, installed_versions, pretrained_folder, read_files
 from agents.algorithms import build_model
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig, ShieldSettings
@@ -32,18 +29,12 @@ from shields.atomic_write import write_atomically
 from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
 
 _FORMAT = "ncs-gym agent 3"
+_DEPENDENCIES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
 
 
 @dataclass(frozen=True, eq=False)
 class Normalization:
-    """Normalizes observations: clip((o - mean) / sqrt(variance + epsilon), -clip, clip).
-
-    Attributes:
-        mean: Mean of the observations in training, shape (entries,).
-        variance: Their variance, shape (entries,).
-        epsilon: Keeps the root away from 0.
-        clip: Largest absolute value of a normalized entry.
-    """
+    """Normalizes observations: clip((o - mean) / sqrt(variance + epsilon), -clip, clip), by entry."""
 
     mean: np.ndarray
     variance: np.ndarray
@@ -52,11 +43,7 @@ class Normalization:
 
     @classmethod
     def of(cls, env: VecNormalize) -> Normalization:
-        """Returns the present statistics of a `VecNormalize`.
-
-        Raises:
-            TypeError: If its observations are dictionaries.
-        """
+        """Returns the present statistics; raises TypeError if observations are dictionaries."""
         statistics = env.obs_rms
         if isinstance(statistics, dict):
             raise TypeError("observations must be one array, got a dictionary of them")
@@ -80,8 +67,8 @@ class Agent:
         model: The stable-baselines3 model.
         normalization: Normalization of the model's observations.
         seed: Seed of the training.
-        shield_mode: Mode of the shield that the agent was trained behind; None for no shield.
-        horizon: Horizon of that shield in mode "lookahead" [steps]; None in other modes.
+        shield_mode: Mode of the shield that the agent was trained behind.
+        horizon: Horizon of that shield in mode "lookahead" [steps].
         kwargs: Other keyword arguments of the environment that it was trained in, JSON values where it is to be saved.
     """
 
@@ -106,14 +93,10 @@ class Agent:
         return self.kwargs | ({} if self.channel is None else {"channel": self.channel})
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Returns deterministic actions, shape (N, m), for raw observations, shape (N, entries).
-
-        Args:
-            observations: As the environment returns them; a single one, shape (entries,), gives one action, shape (m,).
+        """Returns deterministic actions, shape (N, m) or (m,), for raw observations, shape (N, entries) or (entries,).
 
         Raises:
-            ValueError: If observations have another number of entries than those the agent was trained with, or are
-                not finite.
+            ValueError: If observations have another number of entries than in training, or are not finite.
         """
         observations = np.asarray(observations)
         shape, entries = observations.shape, self.normalization.mean.size
@@ -128,24 +111,6 @@ class Agent:
         actions = self.model.predict(self.normalization(batch), deterministic=True)[0]
         return actions[0] if len(shape) == 1 else actions
 
-    def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
-    ) -> tuple[np.ndarray, None]:
-        """Returns actions as `act` does, and no state: what code that has a model of stable-baselines3 calls.
-
-        Args:
-            observation: As for `act`.
-            state: Not used, no policy here is recurrent.
-            episode_start: Not used, either.
-            deterministic: Must be True.
-
-        Raises:
-            ValueError: As `act` does, or if actions are to be drawn.
-        """
-        if not deterministic:
-            raise ValueError("agents act deterministically: agent.model.predict draws, from normalized observations")
-        return self.act(observation), None
-
     @cached_property
     def checksum(self) -> str:
         """SHA-256 of the weights."""
@@ -155,11 +120,7 @@ class Agent:
         return digest.hexdigest()
 
     def files(self) -> dict[str, bytes]:
-        """Returns the contents of `model.zip`, in stable-baselines3's format, and of `agent.json`, with the rest.
-
-        Raises:
-            ValueError: If the environment was made with something that a file does not keep.
-        """
+        """Returns the contents of `model.zip` and `agent.json`; raises ValueError as `require_kept` does."""
         require_kept(self.kwargs, self.env)
         buffer = io.BytesIO()
         self.model.save(buffer)
@@ -168,7 +129,7 @@ class Agent:
             "env": self.env,
             "algorithm": self.algorithm,
             "seed": self.seed,
-            "versions": _versions(),
+            "versions": installed_versions(_DEPENDENCIES),
             "hyperparams": self.hyperparams,
             "channel": to_json(self.channel),
             "shield": self.shield_mode and {"mode": self.shield_mode, "horizon": self.horizon},
@@ -186,14 +147,10 @@ class Agent:
         return {"model.zip": buffer.getvalue(), "agent.json": (json.dumps(content, indent=1) + "\n").encode()}
 
     def save(self, folder: str | Path, shield: ShieldSettings | None = None) -> None:
-        """Writes a folder that can be shared: `model.zip`, `agent.json`, and `certificate.json` of a shield.
-
-        Args:
-            folder: The folder, which is made if it does not exist; files of these names are replaced.
-            shield: The shield that the agent is meant to act behind, whose certificate is saved; None for none.
+        """Writes or replaces `model.zip`, `agent.json`, and `certificate.json` of a shield, in a folder to be shared.
 
         Raises:
-            ValueError: If the certificate is for another plant than that of the agent's environment, or see `files`.
+            ValueError: If the certificate is for another plant than that of the agent's environment; see `files`.
             OSError: If a file cannot be written.
         """
         folder = Path(folder)
@@ -239,12 +196,9 @@ class Agent:
 
 
 def pretrained(env_id: str) -> Agent:
-    """Returns the small agent of an environment that comes with the package.
+    """Returns the small agent that comes with the package for an id.
 
     It was trained behind the shield of the environment's certificate (`shields.certificate_for`).
-
-    Args:
-        env_id: Id of an environment of this package.
 
     Raises:
         AgentError: If the package has none for it, or the environment has changed since.
@@ -273,7 +227,7 @@ def _plant_of(env_id: str, kwargs: Mapping[str, Any]) -> LinearPlant | None:
 
 
 def _is_for_plant_of(env_id: str, kwargs: Mapping[str, Any], fingerprint: str | None) -> bool:
-    """Returns whether what was stored with a fingerprint belongs to an environment's plant, or lack of one."""
+    """Returns whether a fingerprint is that of an environment's plant, None of one without a plant."""
     plant = _plant_of(env_id, kwargs)
     return fingerprint is None if plant is None else fingerprint is not None and plant.fingerprint == fingerprint
 
@@ -322,15 +276,6 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
         horizon=shield["horizon"],
         kwargs=kwargs,
     )
-
-
-def _versions() -> dict[str, str]:
-    """Returns the versions of the installed packages that training depends on."""
-    found = {"python": platform.python_version()}
-    for name in ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy"):
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
 
 
 # What an agent.json has: what else it says might be a part of the policy.

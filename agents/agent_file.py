@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import platform
+from collections.abc import Iterable
+from contextlib import suppress
 from importlib import resources
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from ncs_gym.reading import LARGEST_MODEL, read_file
@@ -17,10 +21,7 @@ class AgentError(ValueError):
 
 
 def read_files(folder: str | Path) -> dict[str, bytes]:
-    """Returns the contents of an agent's files by name; what they hold is looked at by `Agent.of_files`.
-
-    Args:
-        folder: The folder, or one of the two files in it.
+    """Returns the contents of an agent's files by name, given their folder or one of them.
 
     Raises:
         AgentError: If a file is missing, no regular file, or larger than it may be (`ncs_gym.reading`).
@@ -40,26 +41,23 @@ def read_files(folder: str | Path) -> dict[str, bytes]:
 
 
 def pretrained_folder(env_id: str) -> Path:
-    """Returns the folder of the small agent that comes with the package.
-
-    Args:
-        env_id: Id of an environment of this package.
-
-    Raises:
-        AgentError: If the package has none for it; the message names those that it has.
-    """
-    found = _pretrained()
+    """Returns the folder of the small agent that comes with the package for an id; raises AgentError if it has none."""
+    found = pretrained_folders()
     if env_id not in found:
         raise AgentError(f"there is no pretrained agent of {shown(env_id)}, only of {', '.join(found)}")
     return found[env_id]
 
 
-def has_pretrained(env_id: str) -> bool:
-    """Returns whether an agent of an environment comes with the package."""
-    return env_id in _pretrained()
-
-
-def _pretrained() -> dict[str, Path]:
-    """Returns the folders of the agents that come with the package, by the ids of their environments."""
+def pretrained_folders() -> dict[str, Path]:
+    """Returns the folders of the agents that come with the package by id."""
     root = Path(str(resources.files("agents"))) / "trained"
     return {f"ncs_gym/{file.parent.name}": file.parent for file in sorted(root.glob("*/agent.json"))}
+
+
+def installed_versions(packages: Iterable[str]) -> dict[str, str]:
+    """Returns the versions of Python and of those packages that are installed."""
+    found = {"python": platform.python_version()}
+    for name in packages:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

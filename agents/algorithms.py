@@ -12,14 +12,12 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import flatdim
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch.nn.modules import activation
 
 from agents.hyperparams import ALGORITHMS, ON_POLICY, rollout_steps
-from agents.sb3_vec_env import INFO_KEYWORDS
 from ncs_gym.installation import install_command
 from ncs_gym.validation import as_number, reason_of, shown
 
@@ -30,11 +28,7 @@ _LINEAR = "lin_"
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """Returns the class of an algorithm.
-
-    Raises:
-        ModuleNotFoundError: If its package is not installed.
-    """
+    """Returns the class of an algorithm; raises ModuleNotFoundError if its package is not installed."""
     package = ALGORITHMS[name]
     if importlib.util.find_spec(package) is None:
         extra = "contrib" if package == "sb3_contrib" else "train"
@@ -44,7 +38,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 
 
 def normalized_env(name: str, env: VecEnv, hyperparams: Mapping[str, Any]) -> VecNormalize:
-    """Returns an environment as an agent learns in it; agents keep the statistics of the observations.
+    """Returns an environment that normalizes what an agent learns from.
 
     Raises:
         ValueError: If the hyperparameter `normalize` is neither true nor arguments of `VecNormalize`, or leaves
@@ -59,77 +53,43 @@ def normalized_env(name: str, env: VecEnv, hyperparams: Mapping[str, Any]) -> Ve
 
 
 def build_model(name: str, env: VecEnv, hyperparams: Mapping[str, Any], seed: int, steps: int = 0) -> BaseAlgorithm:
-    """Returns an untrained model.
-
-    Args:
-        name: A name in `ALGORITHMS`.
-        env: The environment it will be trained in.
-        hyperparams: What `agents.hyperparams.complete_hyperparams` returns.
-        seed: Seed of the network's weights and of sampling.
-        steps: Number of steps it will be trained for, over which linear rates fall.
+    """Returns an untrained model with complete hyperparameters, whose linear rates fall over so many steps.
 
     Raises:
-        ValueError: If there is no such hyperparameter, or stable-baselines3 does not take its value; the message names
-            those that the algorithm has.
+        ValueError: If there is no such hyperparameter, or stable-baselines3 does not take its value.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     cls = algorithm_class(name)
     try:
         return cls(env=env, seed=seed, device="cpu", **_arguments(name, cls, env, hyperparams, steps))
     except Exception as error:  # the library checks by many kinds of errors
-        known = [*_not_the_librarys(name), *(each for each in _parameters(cls) if each not in _NO_HYPERPARAMS)]
-        raise ValueError(f"{name}: {reason_of(error)}; its hyperparameters are {', '.join(known)}") from error
-
-
-def _not_the_librarys(name: str) -> tuple[str, ...]:
-    """Returns the hyperparameters of an algorithm that its constructor does not take."""
-    return "n_envs", "n_timesteps", "normalize", *(() if name in ON_POLICY else ("noise_std", "stored_action"))
+        raise ValueError(f"{name}: {reason_of(error)}") from error
 
 
 def _arguments(
     name: str, cls: type[BaseAlgorithm], env: VecEnv, hyperparams: Mapping[str, Any], steps: int
 ) -> dict[str, Any]:
     """Returns the arguments of the constructor; raises ValueError if a hyperparameter is unknown."""
-    own: dict[str, Any] = {
-        key: copy.deepcopy(value) for key, value in hyperparams.items() if key not in _not_the_librarys(name)
-    }
+    ours = {"n_envs", "normalize"} | (set() if name in ON_POLICY else {"noise_std"})
+    own: dict[str, Any] = {key: copy.deepcopy(value) for key, value in hyperparams.items() if key not in ours}
     for key, value in own.items():
         if isinstance(value, str) and value.startswith(_LINEAR):
             own[key] = _falling(float(value.removeprefix(_LINEAR)), name, env, hyperparams, steps)
     _require_known(cls, own)
-    if isinstance(given := own.get("policy_kwargs"), dict):
-        own["policy_kwargs"] = policy_arguments(given)
+    if isinstance(given := own.get("policy_kwargs"), dict) and (function := given.get("activation_fn")) is not None:
+        if (named := str(function).removeprefix("nn.")) not in activation.__all__:
+            raise ValueError(f"policy_kwargs: torch.nn has no activation function {shown(function)}")
+        given["activation_fn"] = getattr(activation, named)
     if name in ON_POLICY and "batch_size" in own:
         own["batch_size"] = min(own["batch_size"], hyperparams["n_steps"] * env.num_envs)
-    if (stored := hyperparams.get("stored_action", "proposed")) not in ("proposed", "applied"):
-        raise ValueError(f'stored_action must be "proposed" or "applied", got {shown(stored)}')
-    if stored == "applied" and name not in ON_POLICY and own.get("n_steps", 1) != 1:
-        raise ValueError('stored_action="applied" is stored step by step: n_steps must be 1')
-    if stored == "applied":
-        own["replay_buffer_class"] = AppliedActionBuffer
     if (deviation := hyperparams.get("noise_std")) is not None:
         deviation, size = as_number(deviation, "noise_std", low=0.0), flatdim(env.action_space)
         own["action_noise"] = NormalActionNoise(np.zeros(size), deviation * np.ones(size))
     return own | {"policy": "MlpPolicy"}
 
 
-def policy_arguments(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the hyperparameter `policy_kwargs` as policies take it: with the class of its activation function.
-
-    Raises:
-        ValueError: If torch has no activation function of that name.
-    """
-    found, name = dict(given), given.get("activation_fn")
-    if name is not None:
-        own = str(name).removeprefix("nn.")
-        if own not in activation.__all__:
-            raise ValueError(f"policy_kwargs: torch.nn has no activation function {shown(name)}")
-        found["activation_fn"] = getattr(activation, own)
-    return found
-
-
 def _falling(rate: float, name: str, env: VecEnv, hyperparams: Mapping[str, Any], steps: int) -> LinearSchedule:
-    """Returns a rate that falls linearly; the last update still has the rate at the start of its rollout.
+    """Returns a rate that falls linearly, to that at the start of the last rollout.
 
     The library evaluates the schedule at the end of each rollout, where that of the last one would be zero.
     """
@@ -138,62 +98,8 @@ def _falling(rate: float, name: str, env: VecEnv, hyperparams: Mapping[str, Any]
     return LinearSchedule(rate * (1.0 + fraction), rate * fraction, 1.0)
 
 
-def _parameters(cls: type) -> Mapping[str, inspect.Parameter]:
-    return inspect.signature(cls).parameters
-
-
 def _require_known(cls: type, arguments: Mapping[str, Any], prefix: str = "") -> None:
     """Raises ValueError if a class of the library has no such argument, or it is given here."""
     for name in arguments:
-        if name not in _parameters(cls) or name in _NO_HYPERPARAMS:
+        if name not in inspect.signature(cls).parameters or name in _NO_HYPERPARAMS:
             raise ValueError(f"{prefix}unknown hyperparameter {shown(name)}")
-
-
-# The info that says what was applied: behind a downlink what was decided, to be applied later.
-APPLIED = "action_committed"
-# By how much an action may differ from the agent's that it stands for, where spaces are scaled in float32.
-_SAME_ACTION = 1e-5
-
-
-class AppliedActionBuffer(ReplayBuffer):
-    """Stores, in the place of the agent's action, the one that the shield let through.
-
-    Hand it to SAC, TD3 and their kind as `replay_buffer_class`, and its infos to
-    `SB3VecEnv(info_keywords=AppliedActionBuffer.info_keywords)`. `train` does so with the hyperparameter
-    `stored_action="applied"`. It is for returns of one step (`n_steps=1`), and for actions of one control step.
-
-    Attributes:
-        info_keywords: The infos that it reads, and those that `SB3VecEnv` has at every step anyway.
-    """
-
-    info_keywords = (*INFO_KEYWORDS, APPLIED)
-
-    def add(
-        self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """Adds a transition of every environment.
-
-        Raises:
-            ValueError: If infos do not say what was applied, or something but the shield changes actions.
-        """
-        if not all(APPLIED in info for info in infos):
-            raise ValueError(
-                f'infos have no "{APPLIED}": the buffer is for environments of ncs_gym, in '
-                "SB3VecEnv(envs, info_keywords=AppliedActionBuffer.info_keywords)"
-            )
-        applied = np.array([info[APPLIED] for info in infos])
-        passed = np.array([not info.get("shield_intervened", False) for info in infos])
-        if applied.shape != action.shape or not np.allclose(
-            applied[passed], action[passed].clip(-1.0, 1.0), atol=_SAME_ACTION
-        ):
-            raise ValueError(
-                f'"{APPLIED}" is not the action of the agent, although nothing overrode it: a wrapper outside the '
-                "shield changes actions, and the buffer cannot say which of the agent's stands for what was applied"
-            )
-        super().add(obs, next_obs, applied.astype(action.dtype), reward, done, infos)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,45 +22,34 @@ _MAX_POINTS = 200
 class SafetyCallback(BaseCallback):
     """Counts violations of the true state and interventions in every training step, and logs their rates.
 
-    The counts come from the info of every step, whereas `Monitor` only sees the last step of each episode. The callback
-    works with any stable-baselines3 algorithm, on `SB3VecEnv` and on single environments. TensorBoard gets
-    `safety/violation_rate` and `safety/intervention_rate` (per step since the last log), `safety/mean_correction` (the
-    mean norm of applied minus proposed input since the last log, with a shield), `safety/guaranteed_rate` (steps after
-    which the state is proved safe, since the last log, with a shield) and `safety/violation_steps` (total).
+    It works with any stable-baselines3 algorithm, on `SB3VecEnv` and on single environments. TensorBoard gets
+    `safety/violation_steps` (total) and means over the steps since the last log: `safety/violation_rate`,
+    `safety/intervention_rate`, and with a shield `safety/mean_correction` (norm of applied minus proposed input) and
+    `safety/guaranteed_rate` (steps after which the state is proved safe).
 
-    A training step is counted once. Behind action repeat, which takes several control steps in one, infos are those of
-    the last: `episode_violations` and `episode_interventions` count all.
-
+    A training step is counted once; behind action repeat `episode_violations` and `episode_interventions` count all.
     Totals begin anew where the model counts its steps anew (`learn` with `reset_num_timesteps`).
 
     Args:
         on_progress: Called with the number of steps taken since its last call.
-        history: Totals of the training that this one goes on from; empty for one that begins.
         priced: The penalty of PPO-Lagrangian, whose value totals hold; None without one.
 
     Attributes:
         history: Totals after every rollout; where rollouts are single steps, after every 200th part of the training.
-        violation_steps: Steps so far whose true state violated the safe box.
-        interventions: Steps so far in which the shield intervened.
+        violation_steps, interventions: As in `TrainingPoint`, so far.
     """
 
-    def __init__(
-        self,
-        on_progress: Callable[[int], None] | None = None,
-        history: Sequence[TrainingPoint] = (),
-        priced: CostPenalty | None = None,
-    ) -> None:
+    def __init__(self, on_progress: Callable[[int], None] | None = None, priced: CostPenalty | None = None) -> None:
         super().__init__()
-        self.history = list(history)
         self._on_progress, self._priced = on_progress, priced
-        self._first = TrainingPoint(0, float("nan"), 0, 0)
-        self.violation_steps, self.interventions = self._last.violation_steps, self._last.interventions
+        self.history: list[TrainingPoint] = []
+        self.violation_steps = self.interventions = self._noted = 0
 
     def _on_training_start(self) -> None:
         self._interval = self.locals["total_timesteps"] // _MAX_POINTS
-        if self.num_timesteps < self._last.steps:
+        if self.num_timesteps < self._noted:
             self.history, self.violation_steps, self.interventions = [], 0, 0
-        self._first = TrainingPoint(self.num_timesteps, float("nan"), 0, 0)
+        self._noted = self.num_timesteps
 
     def _on_step(self) -> bool:
         batch = _counted(self)
@@ -77,33 +66,20 @@ class SafetyCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        if self.num_timesteps - self._last.steps >= self._interval:
-            self.add_point()
+        if self.num_timesteps - self._noted >= self._interval:
+            self._note()
 
     def _on_training_end(self) -> None:
-        if self._last.steps < self.num_timesteps:
-            self.add_point()
+        if self._noted < self.num_timesteps:
+            self._note()
 
-    @property
-    def so_far(self) -> list[TrainingPoint]:
-        """The history, to the present step."""
-        return self.history + [self._present] * (self._last.steps < self.num_timesteps)
-
-    @property
-    def _last(self) -> TrainingPoint:
-        return self.history[-1] if self.history else self._first
-
-    @property
-    def _present(self) -> TrainingPoint:
+    def _note(self) -> None:
         returns = [episode["r"] for episode in self.model.ep_info_buffer or ()]
         mean = float(np.mean(returns)) if returns else float("nan")
         multiplier = float("nan") if self._priced is None else self._priced.penalty
-        return TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions, multiplier)
-
-    def add_point(self) -> None:
-        """Adds a point to the curve, of what happened since the last one."""
-        taken = self.num_timesteps - self._last.steps
-        self.history.append(self._present)
+        point = TrainingPoint(self.num_timesteps, mean, self.violation_steps, self.interventions, multiplier)
+        self.history.append(point)
+        taken, self._noted = self.num_timesteps - self._noted, self.num_timesteps
         if self._on_progress is not None:
             self._on_progress(taken)
 
@@ -116,19 +92,17 @@ class DualAscentCallback(BaseCallback):
 
         multiplier <- max(0, multiplier + learning_rate (J - d)).
 
-    It is for algorithms that learn from fresh rollouts: a replay buffer keeps rewards at former prices. Rollouts that
-    are shorter than an episode are taken together until they are as long. J does not wait for episodes to end, which
-    those of many environments do in the same step, and an episode that a violation ends does not count as a cheap one.
+    Rollouts that are shorter than an episode are taken together until they are as long. J does not wait for episodes to
+    end, and an episode that a violation ends does not count as a cheap one.
 
     This is the constrained baseline of Ray et al. 2019 with a plain gradient step in place of Adam, and the PID
     controller of Stooke et al. 2020 with the integral term alone (docs/bibliography.md). The cost is part of
-    the reward, so one value function estimates both, where theirs have one each. With a limit of zero the multiplier
-    never falls. TensorBoard gets `safety/multiplier`.
+    the reward, so one value function estimates both, where theirs have one each. TensorBoard gets `safety/multiplier`.
 
     Args:
         settings: Limit and learning rate.
-        priced: The environment's penalty, which is set.
-        episode_steps: Steps of an episode of full length, as `LoopConfig.episode_steps` says.
+        priced: The penalty, which is set.
+        episode_steps: See `LoopConfig.episode_steps`.
     """
 
     def __init__(self, settings: LagrangianSettings, priced: CostPenalty, episode_steps: int) -> None:

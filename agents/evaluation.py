@@ -35,10 +35,9 @@ def evaluate(
     """Returns what a policy does in a number of episodes, played side by side.
 
     Args:
-        loop: The control loop, whose penalties are left out. Every episode is played once, to its end, whatever
-            autoreset the loop has.
+        loop: The control loop, whose penalties are left out, and whose autoreset counts for nothing.
         policy: Maps observations and infos to actions.
-        episodes: Number of episodes, at least 1.
+        episodes: How many, at least 1.
         seed: Seed of all random numbers (see `Episode.index`).
         safe_set: M, shape (n, n), or a polytope, for `Episode.times_safe_set`.
         on_progress: Called with the number of steps taken since its last call.
@@ -56,7 +55,7 @@ def evaluate(
     for first in range(0, episodes, _MAX_PARALLEL_EPISODES):
         indices = range(first, min(first + _MAX_PARALLEL_EPISODES, episodes))
         finished += _played(alone, policy, indices, seed, safe_set, on_progress)
-    return Evaluation(loop, finished)
+    return Evaluation(finished)
 
 
 def _played(
@@ -67,7 +66,6 @@ def _played(
     safe_set: np.ndarray | Polytope | None,
     on_progress: Callable[[int], None] | None,
 ) -> list[Episode]:
-    """Returns episodes played side by side."""
     count, envs = len(indices), loop.vector(len(indices))
     inner: Any = envs.unwrapped
     if envs.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
@@ -86,8 +84,11 @@ def _played(
     totals = {name: np.zeros(count, np.int64) for name in names}
     while True:
         guaranteed &= info.get("shield_guaranteed", nothing).astype(np.bool_) | ~running
-        if safe_set is not None:
-            largest = np.maximum(largest, np.where(running, _times(info["state"], safe_set), 0.0))
+        if isinstance(safe_set, Polytope):
+            largest = np.maximum(largest, np.where(running, safe_set.gauge(info["state"]), 0.0))
+        elif safe_set is not None:
+            levels = np.einsum("ei,ij,ej->e", info["state"], safe_set, info["state"])
+            largest = np.maximum(largest, np.where(running, np.sqrt(np.maximum(levels, 0.0)), 0.0))
         running &= ~ended
         if not running.any():
             break
@@ -120,10 +121,3 @@ def _played(
         )
         for e, index in enumerate(indices)
     ]
-
-
-def _times(states: np.ndarray, of: np.ndarray | Polytope) -> np.ndarray:
-    """Returns how many times a safe set holds states, shape (N, n): 1 on its boundary."""
-    if isinstance(of, Polytope):
-        return of.gauge(states)
-    return np.sqrt(np.maximum(np.einsum("ei,ij,ej->e", states, of, states), 0.0))

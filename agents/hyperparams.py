@@ -5,12 +5,9 @@ Most are keyword arguments of the algorithm's constructor in stable-baselines3, 
 and these names are no arguments of the constructor:
 
 - `n_envs`: number of environments stepped side by side;
-- `n_timesteps`: training steps, where the caller asks for no number of them;
 - `normalize`: true, or arguments of `VecNormalize` such as `{"norm_reward": false}`;
 - `noise_std`: exploration noise of off-policy algorithms, in units of the limits;
-- `policy_kwargs`: may have `activation_fn`, an activation function of `torch.nn` by its name, such as "nn.ReLU";
-- `stored_action`: of off-policy algorithms, "applied" to learn from the actions that the shield applied, "proposed"
-  (the default) from the agent's own.
+- `policy_kwargs`: may have `activation_fn`, an activation function of `torch.nn` by its name, such as "nn.ReLU".
 
 `agents/tuned/ppo.json` has those found by a search for each registered environment (docs/agents.md).
 """
@@ -85,19 +82,22 @@ def with_changes(hyperparams: Mapping[str, Any], changes: Mapping[str, Any]) -> 
 def complete_hyperparams(algorithm: str, given: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Returns the hyperparameters that an algorithm is trained with: those given, and the defaults.
 
-    Args:
-        algorithm: A name in `ALGORITHMS`.
-        given: Hyperparameters by name; None for none.
-
     Raises:
         ValueError: If the algorithm is unknown, what is given is no dictionary of JSON values, or `gamma` or a count
-            (`n_envs`, `n_steps`, `n_epochs`, `batch_size`, `buffer_size`) is out of range.
+            such as `n_envs` is out of range.
     """
     if not (isinstance(algorithm, str) and algorithm in ALGORITHMS):
         raise ValueError(f"unknown algorithm {shown(algorithm)}; known are {', '.join(ALGORITHMS)}")
     if not isinstance(given, Mapping | None):
         raise ValueError(f"hyperparameters must be a dictionary, got {type(given).__name__}")
-    hyperparams = with_changes(DEFAULTS[algorithm], _as_json(given or {}))
+    try:
+        copied = json.loads(json.dumps(dict(given or {}), allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(
+            f"hyperparameters must be JSON values, got {shown(given)} ({reason_of(error)}); what is none is written as "
+            "a text, as in 'nn.ReLU' or 'lin_0.003'"
+        ) from error
+    hyperparams = with_changes(DEFAULTS[algorithm], copied)
     for name in _COUNTS:
         if name in hyperparams and (type(value := hyperparams[name]) is not int or value < 1):
             raise ValueError(f"{name} must be a whole number >= 1, got {shown(value)}")
@@ -114,12 +114,7 @@ def rollout_steps(algorithm: str, hyperparams: Mapping[str, Any]) -> int:
 
 
 def tuned_hyperparams(env_id: str, algorithm: str = "PPO") -> dict[str, Any] | None:
-    """Returns the hyperparameters tuned for an environment; None where there are none, as for plants of one's own.
-
-    Args:
-        env_id: Id by which the environment is registered.
-        algorithm: Name of the learning algorithm; none but PPO is tuned.
-    """
+    """Returns the hyperparameters tuned for a registered id; None where there are none. None but PPO is tuned."""
     entry = _tuned().get(env_id) if algorithm == "PPO" else None
     return None if entry is None else {name: value for name, value in entry.items() if name != "n_timesteps"}
 
@@ -132,18 +127,3 @@ def tuned_steps(env_id: str, algorithm: str = "PPO") -> int | None:
 @cache
 def _tuned() -> dict[str, dict[str, Any]]:
     return json.loads(resources.files("agents").joinpath("tuned", "ppo.json").read_text("utf-8"))
-
-
-def _as_json(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a copy; raises ValueError for the first value that JSON has not."""
-    copied: dict[str, Any] = {}
-    for name, value in hyperparams.items():
-        try:
-            copied |= json.loads(json.dumps({name: value}, allow_nan=False))
-        except (TypeError, ValueError, RecursionError) as error:
-            given = f"{shown(name)}: {shown(value)}"
-            raise ValueError(
-                f"hyperparameters must be JSON values, got {given} ({reason_of(error)}); what is none is written as a "
-                "text, as in 'nn.ReLU' or 'lin_0.003'"
-            ) from error
-    return copied

@@ -21,18 +21,10 @@ from shields.runtime.safety_filter import plan_horizon
 
 @dataclass(frozen=True)
 class ShieldSettings:
-    """Settings of the shield around an environment.
-
-    Attributes:
-        certificate: Certificate of the safe set; it is verified when the shield is built.
-        mode: Mode of `SafetyShield`: "project", "lookahead", "switch", "boundary" or "monitor".
-        penalty: Subtracted from the reward for every intervention.
-        horizon: Longest plan of mode "lookahead" [steps]; None becomes the shield's default there.
-        on_unproved: What the shield does where the state is not proved safe: "ignore", "warn" or "raise".
+    """Settings of a `SafetyShield`, which verifies the certificate when it is built.
 
     Raises:
-        ValueError: If the mode is unknown, or what is to be done where nothing is proved, or the certificate is none
-            that a shield takes, or mode "lookahead" does not take the horizon, or the penalty is negative.
+        ValueError: If a value is none that a shield takes.
     """
 
     certificate: Certificate
@@ -86,8 +78,8 @@ class LoopConfig:
         lagrangian: How the violation penalty is adapted in training, instead of a fixed one.
 
     Raises:
-        ValueError: If the shield is something else, another filter is given beside a shield, the id is
-            not registered, a penalty is wrong, or `lagrangian` limits the cost of episodes without an end.
+        ValueError: If the shield is something else, a filter is given beside it, the id is not registered, a penalty is
+            wrong, or `lagrangian` limits the cost of episodes without an end.
     """
 
     env: str
@@ -133,7 +125,7 @@ class LoopConfig:
 
     @property
     def other_kwargs(self) -> dict[str, Any]:
-        """Keyword arguments besides the channel, JSON values where they can be: as files of agents keep them."""
+        """Keyword arguments besides the channel, as files of agents keep them."""
         kwargs = {name: value for name, value in self.kwargs.items() if name != "channel"}
         if "plant" in kwargs:
             kwargs["plant"] = read_plant(kwargs["plant"])
@@ -154,10 +146,7 @@ class LoopConfig:
         return replace(self, shield=shield, filter=filtered, violation_penalty=0.0, lagrangian=None)
 
     def single(self, **settings: Any) -> gym.Env:
-        """Returns one environment, with the shield; penalties of violations and filter are for vectors.
-
-        `settings` are passed to `gym.make`.
-        """
+        """Returns one environment, with the shield; penalties of violations and filter are for vectors."""
         env = gym.make(self.env, **{**self.kwargs, **settings})
         return env if self.shield is None else SafetyShield(env, **vars(self.shield))
 
@@ -179,19 +168,14 @@ class LoopConfig:
 
 
 class CostPenalty(AroundEnvironments, VectorWrapper):
-    """Subtracts a penalty from the reward of every step after which the true state violates the safe box.
-
-    Args:
-        env: A vector environment with `cost` in its infos.
-        penalty: Subtracted per violating step; may be changed while an agent is trained.
-    """
+    """Subtracts a penalty, which may be changed, from the reward of every step that violates the safe box."""
 
     def __init__(self, env: VectorEnv, penalty: float) -> None:
         self.penalty = penalty
         super().__init__(env)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Steps the environments; the cost of an episode's last step is read from its final info."""
+        """Steps the environments; raises ValueError if their infos have no cost."""
         observation, rewards, terminated, truncated, info = self.env.step(actions)
         if "cost" not in info:
             raise ValueError('a penalty of violations needs environments with "cost" in their infos, these have none')

@@ -37,38 +37,22 @@ class SB3VecEnv(VecEnv):
     stable-baselines3 expects the step that ends an episode to return the first observation of the next episode, and
     the last observation in `info["terminal_observation"]`. This class provides that exactly for SAME_STEP autoreset,
     and for NEXT_STEP and DISABLED where single environments can be reset (`NCSVectorEnv`, gymnasium's sync and async).
-    Other NEXT_STEP environments take a step to reset: with `allow_reset_transitions=True` the learner sees that step,
-    once per episode, as a transition of reward 0 from the last observation of an episode to the first of the next.
 
     Like `Monitor` it adds `info["episode"]` (`r`, `l`, `t`) to the last step of an episode, with `episode_violations`,
     `is_success` and `episode_guaranteed` where there are such infos. Besides, the dict of an environment has those of
     its infos that `info_keywords` names, at every step; `batch_info` has all infos as arrays.
 
-    Importing this class sets torch to one thread, with which small networks train fastest; call
-    `torch.set_num_threads` after the import for another number.
-
-    Args:
-        vector_env: The vector environment.
-        info_keywords: Infos that stand in the dict of every step, for buffers and callbacks that read them.
-        allow_reset_transitions: Whether to accept environments that take a step to reset.
+    Importing this class sets torch to one thread; call `torch.set_num_threads` after the import for another number.
 
     Attributes:
-        vector_env: The vector environment.
         batch_info: Infos of the last step, arrays with the environment as first axis; for an environment whose episode
             ended they are those of the episode's last step.
 
     Raises:
-        ValueError: If episodes cannot be restarted in the step that ends them and that is not allowed, or if
-            observations are not arrays.
+        ValueError: If episodes cannot be restarted in the step that ends them, or observations are not arrays.
     """
 
-    def __init__(
-        self,
-        vector_env: VectorEnv,
-        *,
-        info_keywords: Sequence[str] = INFO_KEYWORDS,
-        allow_reset_transitions: bool = False,
-    ) -> None:
+    def __init__(self, vector_env: VectorEnv, *, info_keywords: Sequence[str] = INFO_KEYWORDS) -> None:
         if not isinstance(vector_env, (VectorEnv, gym.vector.VectorWrapper)):
             raise ValueError(f"vector_env must be a gymnasium VectorEnv, got {type(vector_env).__name__}")
         if isinstance(vector_env.single_observation_space, (gym.spaces.Dict, gym.spaces.Tuple)):
@@ -86,23 +70,17 @@ class SB3VecEnv(VecEnv):
         self.vector_env, self._info_keywords = vector_env, tuple(info_keywords)
         self._mode = vector_env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         self._masks = isinstance(vector_env.unwrapped, _WITH_RESET_MASK)
-        if self._mode is not AutoresetMode.SAME_STEP and not self._masks and not allow_reset_transitions:
+        if self._mode is not AutoresetMode.SAME_STEP and not self._masks:
             raise ValueError(
-                f"{type(vector_env.unwrapped).__name__} takes a step of its own to reset: make it with SAME_STEP "
-                "autoreset, or accept a transition of reward 0 per episode with allow_reset_transitions=True"
+                f"{type(vector_env.unwrapped).__name__} cannot reset some environments in the step that ends their "
+                'episode: make it with autoreset_mode="SameStep", or with vectorization_mode="sync"'
             )
-        if self._mode is AutoresetMode.DISABLED and not self._masks:
-            raise ValueError(f"{type(vector_env.unwrapped).__name__} does not reset at all")
         self.batch_info: dict[str, Any] = {}
         self._started = time.time()
         super().__init__(vector_env.num_envs, vector_env.single_observation_space, vector_env.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Starts all episodes, with the seeds and options given by `seed` and `set_options`, which are for these only.
-
-        Raises:
-            ValueError: If options differ between environments.
-        """
+        """Starts all episodes, with the seeds and options of `seed` and `set_options`, which have to be the same."""
         options = self._options[0]
         if not all(_same(option, options) for option in self._options):
             self._reset_options()
@@ -120,7 +98,6 @@ class SB3VecEnv(VecEnv):
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._keep_first_infos(np.ones(self.num_envs, np.bool_), info)
         self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
-        self._resetting = np.zeros(self.num_envs, np.bool_)
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -132,7 +109,7 @@ class SB3VecEnv(VecEnv):
         observation, rewards, terminated, truncated, info = self.vector_env.step(self._actions)
         done = terminated | truncated
         self._returns += rewards
-        self._lengths += ~self._resetting
+        self._lengths += 1
         last = observation
         self.batch_info = info
         if self._mode is AutoresetMode.SAME_STEP and done.any():
@@ -148,23 +125,18 @@ class SB3VecEnv(VecEnv):
             self._returns[done], self._lengths[done] = 0.0, 0
             if self._mode is AutoresetMode.SAME_STEP:
                 self._keep_first_infos(done, info)
-            elif self._masks:
+            else:
                 fresh, reset_info = self.vector_env.reset(options={"reset_mask": done.copy()})
                 observation = np.where(done.reshape(-1, *[1] * (observation.ndim - 1)), fresh, observation)
                 self._keep_first_infos(done, reset_info)
-            elif self._mode is AutoresetMode.NEXT_STEP:
-                self._resetting = done
-                return observation, rewards.astype(np.float32), done, infos
-        self._resetting = np.zeros(self.num_envs, np.bool_)
         return observation, rewards.astype(np.float32), done, infos
 
     def _keep_first_infos(self, chosen: np.ndarray, info: dict[str, Any]) -> None:
-        """Keeps the infos of the first observations of some environments' episodes, bool (N,)."""
         for e in np.flatnonzero(chosen).tolist():
             self.reset_infos[e] = _info_of(info, e)
 
     def _last_info(self, e: int, info: dict[str, Any], observation: np.ndarray, cut: bool) -> dict[str, Any]:
-        """Returns the info of environment e, whose episode ends in this step, given what was reported."""
+        """Returns the info of environment e, whose episode ends, made of what was reported."""
         elapsed = round(time.time() - self._started, 6)
         info["episode"] = {"r": float(self._returns[e]), "l": int(self._lengths[e]), "t": elapsed}
         info["episode"] |= {key: float(info[key]) for key in _EPISODE_KEYS if key in info}
@@ -223,7 +195,6 @@ class SB3VecEnv(VecEnv):
 
 
 def _dense(info: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Returns those infos that are arrays with an entry per environment."""
     return {
         key: value
         for key, value in info.items()
@@ -237,7 +208,7 @@ def _named(info: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
 
 
 def _step_infos(info: dict[str, Any], count: int) -> list[dict[str, Any]]:
-    """Returns what each of some environments reported, as a dict of its own in which no episode ends."""
+    """Returns a dict per environment with what it reported, in which no episode ends."""
     if any(isinstance(value, dict) or (key.startswith("_") and not np.all(value)) for key, value in info.items()):
         return [{"TimeLimit.truncated": False} | _info_of(info, e) for e in range(count)]
     infos: list[dict[str, Any]] = [{"TimeLimit.truncated": False} for _ in range(count)]
@@ -258,7 +229,7 @@ def _info_of(info: dict[str, Any], e: int) -> dict[str, Any]:
 
 
 def _with_final(info: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
-    """Returns the infos, with those of the last step for environments whose episode ended."""
+    """Returns the infos, of environments whose episode ended those of the last step."""
     final = _dense(info.get("final_info", {}))
     merged = dict(info) | {key: value for key, value in final.items() if key not in info}
     for key in final.keys() & _dense(info).keys():
@@ -268,7 +239,7 @@ def _with_final(info: dict[str, Any], done: np.ndarray) -> dict[str, Any]:
 
 
 def _has_own(source: VectorEnv, name: str) -> bool:
-    """Returns whether a vector environment or wrapper has an attribute itself, not by what is inside."""
+    """Returns whether a layer has an attribute itself, not by what is inside."""
     return name in vars(source) or hasattr(type(source), name)
 
 

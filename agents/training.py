@@ -5,45 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import partial
-from math import isnan
 from pathlib import Path
 from typing import Any
 
 from gymnasium.vector import VectorEnv
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, EveryNTimesteps
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.agent import Agent, Normalization, require_kept
-from agents.algorithms import AppliedActionBuffer, build_model, normalized_env
+from agents.algorithms import build_model, normalized_env
 from agents.callbacks import OTHERS, DualAscentCallback, SafetyCallback
 from agents.hyperparams import ON_POLICY, complete_hyperparams
 from agents.loop import CostPenalty, LoopConfig
-from agents.results import HISTORY_FILE, TrainingPoint, TrainingStopped, history_document
-from agents.sb3_vec_env import INFO_KEYWORDS, SB3VecEnv
+from agents.results import TrainingPoint
+from agents.sb3_vec_env import SB3VecEnv
 from ncs_gym.validation import counted, reason_of, warn_caller
-from shields.atomic_write import write_atomically
 
 # Observations that the normalization of an agent to go on from counts as.
 KNOWN_STEPS = 100_000
-# An agent that is trained is kept about so often on the way.
-_TIMES = 10
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a training run returns.
-
-    Attributes:
-        agent: The trained policy.
-        history: Totals up to different steps of the training.
-        steps: Environment steps taken, in whole rollouts: at least as many as were asked for. Like all totals, with
-            those of the training that it went on from.
-        violation_steps: Training steps whose true state violated the safe box.
-        interventions: Training steps in which the shield intervened.
-    """
+    """A trained agent, totals up to different steps of its training, and those at the end (see `TrainingPoint`)."""
 
     agent: Agent
     history: list[TrainingPoint] = field(repr=False)
@@ -63,78 +49,49 @@ def train(
     on_progress: Callable[[int], None] | None = None,
     callbacks: Sequence[BaseCallback] = (),
     start: Agent | None = None,
-    history: Sequence[TrainingPoint] = (),
-    checkpoints: Path | None = None,
 ) -> TrainingResult:
     """Returns a trained agent and what happened on the way; the same seed gives the same result on one machine.
 
-    torch has one thread once `agents.SB3VecEnv` is imported; `torch.set_num_threads` changes both that and results.
-
     Args:
-        loop: The control loop the agent is trained in.
+        loop: The control loop.
         steps: Environment steps to train for, rounded up to whole rollouts.
         seed: Seed of environments, network weights and sampling. Loops with the same seed use common random numbers
             (starts, disturbances, noise, packet losses) as long as their episodes last equally long.
         algorithm: A name in `agents.hyperparams.ALGORITHMS`.
         hyperparams: Keyword arguments of the algorithm in stable-baselines3, and `n_envs` and `normalize`, JSON values;
-            what is not given has the values of `agents.hyperparams.DEFAULTS`. `n_timesteps` is for `ncs train`: here
-            `steps` counts.
-        log_folder: Folder for TensorBoard's events; None for none.
-        on_progress: Called with the number of steps taken since its last call; `TrainingStopped` ends the training.
+            what is not given has the values of `agents.hyperparams.DEFAULTS`.
+        log_folder: Folder for TensorBoard's events.
+        on_progress: Called with the number of steps taken since its last call; an exception ends the training.
         callbacks: Callbacks of stable-baselines3 of your own, after those of this package.
-        start: An agent to go on from, of the same environment, algorithm and networks: its weights, the state of its
-            optimizers and its normalization; replay buffers begin anew, with random actions for `learning_starts` steps
-            that count. Give another seed: with the same one it meets the same starts and packet losses once more.
-        history: Totals of the training of that agent: counts and the multiplier of PPO-Lagrangian go on from the last,
-            and rates fall as in one training of all steps. Empty to count from 0, and for rates that begin anew.
-        checkpoints: Folder that holds the agent as it is and its history, written ten times on the way and at the end,
-            also of a training that is interrupted (Ctrl-C); None for none.
+        start: An agent to go on from, of the same environment, algorithm and networks: its weights, optimizers and
+            normalization. Give another seed: with the same one it meets the same starts and packet losses once more.
 
     Warns:
         UserWarning: If files of agents do not keep a keyword argument of the environment.
 
     Raises:
         ValueError: If the agent to go on from does not fit, the algorithm or a hyperparameter is unknown,
-            stable-baselines3 does not take a value, no step is left to learn in, or checkpoints cannot be saved.
+            stable-baselines3 does not take a value, or no step is left to learn in.
         ModuleNotFoundError: If the algorithm's package is not installed.
     """
     hyperparams = complete_hyperparams(algorithm, hyperparams)
-    before = history[-1].steps if history else 0
     try:
         require_kept(loop.other_kwargs, loop.env)
     except ValueError as error:
-        if checkpoints is not None:
-            raise
         warn_caller(f"the agent cannot be saved: {error}", UserWarning)
-    envs, env, model = _trainable(loop, steps, seed, algorithm, hyperparams, before)
+    envs, env, model = _trainable(loop, steps, seed, algorithm, hyperparams)
     model.set_logger(configure(str(log_folder), ["tensorboard"]) if log_folder else Logger(None, []))
     beside: list[BaseCallback] = []
     priced = envs if loop.lagrangian is not None and isinstance(envs, CostPenalty) else None
     if loop.lagrangian is not None and priced is not None and (episode_steps := loop.episode_steps) is not None:
-        if history and not isnan(history[-1].multiplier):
-            priced.penalty = history[-1].multiplier
         # Before the totals, which hold the next price.
         beside.append(DualAscentCallback(loop.lagrangian, priced, episode_steps))
-    callback = SafetyCallback(on_progress, history, priced)
+    callback = SafetyCallback(on_progress, priced)
     beside.append(callback)
     if start is not None:
         _go_on(start, loop, algorithm, model, env)
-    current = partial(_agent, loop, algorithm, hyperparams, model, env, seed)
-
-    def keep() -> None:
-        if checkpoints is not None:
-            current().save(checkpoints, loop.shield)
-            write_atomically(checkpoints / HISTORY_FILE, history_document(callback.so_far))
-
-    if checkpoints is not None:
-        beside.append(EveryNTimesteps(max(steps // _TIMES, 1), ConvertCallback(lambda *_: keep() or True)))
-    try:
-        model.learn(steps, callback=[*beside, *callbacks], reset_num_timesteps=False)
-    except (KeyboardInterrupt, TrainingStopped):
-        keep()
-        raise
-    keep()
-    agent = current()
+    model.learn(steps, callback=[*beside, *callbacks])
+    agent = _agent(loop, algorithm, hyperparams, model, env, seed)
     return TrainingResult(
         agent, callback.history, model.num_timesteps, callback.violation_steps, callback.interventions
     )
@@ -150,17 +107,14 @@ def untrained(
 
 
 def require_trainable(loop: LoopConfig, steps: int, algorithm: str, hyperparams: Mapping[str, Any]) -> None:
-    """Raises what `train` would with these arguments, before anything is computed."""
+    """Raises what `train` would with these arguments."""
     _trainable(loop, steps, 0, algorithm, complete_hyperparams(algorithm, hyperparams))[0].close()
 
 
 def _trainable(
-    loop: LoopConfig, steps: int, seed: int, algorithm: str, hyperparams: dict[str, Any], before: int = 0
+    loop: LoopConfig, steps: int, seed: int, algorithm: str, hyperparams: dict[str, Any]
 ) -> tuple[VectorEnv, VecNormalize, BaseAlgorithm]:
-    """Returns what a training begins with: the environments, the same as stable-baselines3 sees them, and the model.
-
-    The model has taken `before` steps.
-    """
+    """Returns what a training begins with: the environments, the same as stable-baselines3 sees them, and the model."""
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
     if loop.lagrangian is not None and algorithm not in ON_POLICY:
@@ -169,21 +123,17 @@ def _trainable(
             f"of {algorithm} keeps rewards with the price of a violation that there was when they were collected"
         )
     envs = loop.vector(hyperparams["n_envs"])
-    stores_applied = hyperparams.get("stored_action") == "applied"
     try:
-        seen = SB3VecEnv(envs, info_keywords=AppliedActionBuffer.info_keywords if stores_applied else INFO_KEYWORDS)
+        seen = SB3VecEnv(envs)
     except ValueError as error:
         raise ValueError(f"{loop.env}: {error}; {OTHERS}") from error
     env = normalized_env(algorithm, seen, hyperparams)
-    model = build_model(algorithm, env, hyperparams, seed, before + steps)
-    model.num_timesteps = before
-    if algorithm not in ON_POLICY:
-        if steps <= hyperparams["learning_starts"]:
-            raise ValueError(
-                f"a training of {counted(steps, 'step')} trains nothing: learning starts after "
-                f"{hyperparams['learning_starts']}"
-            )
-        model.learning_starts += before  # type: ignore[attr-defined]  # the replay buffer is filled first, as always
+    model = build_model(algorithm, env, hyperparams, seed, steps)
+    if algorithm not in ON_POLICY and steps <= hyperparams["learning_starts"]:
+        raise ValueError(
+            f"a training of {counted(steps, 'step')} trains nothing: learning starts after "
+            f"{hyperparams['learning_starts']}"
+        )
     return envs, env, model
 
 

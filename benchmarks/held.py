@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.commands import run, table
 from benchmarks.published import certified, channel_of, contract_of_plant, plant_of
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
 from ncs_gym import LinearPlant, NCSVectorEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.plants.lqr import lqr_gain
@@ -160,7 +160,7 @@ def _windup_drawn(
         for (text, values), color in zip(drawn.items(), ("#0072b2", "#d55e00"), strict=True):
             axis.plot(times, values, color=color, label=text)
         axis.set(xlim=(0.0, times[-1]), ylim=np.array([-0.2, 1.6]) * plant.own_limits[1, state])
-        label(axis, "time [s]", with_unit(plant.state_names[state], plant.state_units[state]))
+        label(axis, "time [s]", f"{plant.state_names[state]} [{plant.state_units[state]}]")
         legend_below(figure, dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True)))
     return figure
 

@@ -33,8 +33,7 @@ from agents.loop import LagrangianSettings
 from benchmarks.commands import run, some_of
 from benchmarks.suite import ENTRIES, REGULATED, TASKS, observing, rows_of
 from benchmarks.timing import timed
-from experiments.baselines import RegulatorWeights, controller
-from experiments.baselines.controllers import OBSERVER
+from experiments.baselines.controllers import OBSERVER, RegulatorWeights, controller
 from experiments.commands.compare import CompareSettings
 from experiments.runs.arms import Arm
 from ncs_gym.envs.env import ncs_env

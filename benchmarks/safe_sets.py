@@ -24,8 +24,8 @@ from scipy.stats import qmc
 
 from benchmarks.commands import run, table
 from benchmarks.timing import least_times, timed
-from experiments.baselines import controller
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below, with_unit
+from experiments.baselines.controllers import controller
+from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
 from ncs_gym import LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Infeasible, SafetyFilter, VectorSafetyShield, synthesize
@@ -112,7 +112,7 @@ def sections(out: Path = Path("safe-sets.png"), ids: Sequence[str] = IDS) -> Non
                 (handles[kind],) = axes.plot(*outline, color=COLORS[kind], lw=1.5)
             box = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * plant.half_widths[list(plane)]
             (handles["safe box"],) = axes.plot(*box.T, color="#222222", lw=1.0, ls="--")
-            x, y = (with_unit(plant.state_names[k], plant.state_units[k]) for k in plane)
+            x, y = (f"{plant.state_names[k]} [{plant.state_units[k]}]" for k in plane)
             label(axes, x, y, name)
         legend_below(figure, handles)
         out.write_bytes(figure.png)

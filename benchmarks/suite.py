@@ -26,7 +26,7 @@ from benchmarks.suite_observations import Remembered, Shown
 from experiments.analysis.episodes import episodes_table, training_table
 from experiments.analysis.statistics import CONFIDENCE, clopper_pearson
 from experiments.backends.execution import results_of
-from experiments.baselines import tuned_training
+from experiments.baselines.tuned import tuned_training
 from experiments.commands.compare import CompareSettings
 from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import AS_TRAINED, certificate_of, loop_config, registered_env, under

@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium.vector import VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from experiments.baselines import tuned_weights
 from experiments.baselines.observer import DisturbanceObserver
+from experiments.baselines.tuned import tuned_weights
 from ncs_gym.validation import AroundEnvironments
 
 

@@ -5,7 +5,6 @@ Whatever takes time to import is imported inside `main`, where an interrupt ends
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 
@@ -16,32 +15,8 @@ a command, `ncs --version` prints the version. The commands:
 """
 _ERROR = 2
 _INTERRUPTED = 130
-# What to do about an error of the operating system.
-_REMEDIES = {
-    errno.EEXIST: "a file stands where a folder is needed, choose another path",
-    errno.ENOTDIR: "a file stands where a folder is needed, choose another path",
-    errno.EISDIR: "a folder stands where a file is needed, name the file",
-    errno.ENOENT: "check the path",
-    errno.EACCES: "choose a path where you may read and write",
-    errno.ENOSPC: "make room and start the command again, which keeps what is finished",
-}
-# What each command does: the first sentence of its settings.
-COMMANDS = {
-    "compare": "Trains agents with and without the shield and compares violations, return and interventions.",
-    "train": "Trains one agent, evaluates it, and saves it with everything needed to use it.",
-    "evaluate": "Evaluates a trained agent, behind a shield or not, on any channel.",
-    "sweep": "Compares arms over a grid of channels: how safety, return and interventions depend on the channel.",
-    "render": "Draws an episode of a policy, as an animation or its last frame.",
-    "synthesize": "Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.",
-    "verify": "Verifies a certificate in exact rational arithmetic against the plant it was made for.",
-    "export-c": "Writes a safety filter in C99 for a board, with test vectors that check it.",
-    "bounds": "Says what bounds of a plant's disturbances a record of it proves, and writes a plant with them.",
-    "channel": "Reads recorded packets, and says how often each channel contract would have been broken.",
-    "requirements": "Finds how old and how coarse the samples of a plant may be, so that it is certifiable.",
-    "attack": "Attacks shielded loops with worst-case disturbances and agents, and counts states outside.",
-    "audit": "Checks the claims of the paper (Liu et al.) one by one, from its own printed numbers.",
-    "reproduce": "Simulates Section 5 of Liu et al. with three designs: printed, certified, and OP's.",
-}
+COMMANDS = ("compare", "train", "evaluate", "sweep", "render", "synthesize", "verify", "bounds", "channel")
+COMMANDS += ("requirements", "attack", "paper")
 # The extra that a command needs, and the packages of an extra.
 _EXTRAS = dict.fromkeys(("compare", "train", "evaluate", "sweep"), "train") | {"render": "render"}
 _PACKAGES = {
@@ -80,7 +55,7 @@ def main() -> None:
         else:
             with nullcontext() if os.environ.get("NCS_DEBUG") else warnings_as_sentences():
                 settings = parse(sys.argv[1:])
-                getattr(_module(command), command.replace("-", "_"))(settings)
+                getattr(_module(command), command)(settings)
     except KeyboardInterrupt as interrupt:
         sys.exit(_complain(str(interrupt) or "interrupted", _INTERRUPTED))
     except BrokenPipeError:
@@ -111,13 +86,13 @@ def parse(arguments: list[str]) -> object:
 
 def settings_of(command: str) -> type:
     """Returns the class of a command's settings."""
-    return getattr(_module(command), f"{command.title().replace('-', '')}Settings")
+    return getattr(_module(command), f"{command.title()}Settings")
 
 
 def _module(command: str) -> object:
     from importlib import import_module
 
-    return import_module(f"experiments.commands.{command.replace('-', '_')}")
+    return import_module(f"experiments.commands.{command}")
 
 
 def _require_extra(extra: str) -> None:
@@ -132,16 +107,23 @@ def _require_extra(extra: str) -> None:
 
 
 def _overview() -> str:
-    """Returns the commands, each with the first sentence about it, in lines of the terminal's width."""
+    """Returns the commands with the first sentence about their settings, read without importing what they need."""
+    import ast
+    from pathlib import Path
+
     from experiments.terminal import wrapped
 
-    indent = max(map(len, COMMANDS)) + 4
-    lines = [wrapped(does, label=f"  {name}", indent=indent) for name, does in COMMANDS.items()]
-    return "\n".join([_USAGE, *lines])
+    lines, indent = [_USAGE], max(map(len, COMMANDS)) + 4
+    for name in COMMANDS:
+        module = ast.parse((Path(__file__).parent / "commands" / f"{name}.py").read_text("utf-8"))
+        settings = next(node for node in module.body if isinstance(node, ast.ClassDef))
+        does = (ast.get_docstring(settings) or "").partition("\n\n")[0]
+        lines.append(wrapped(" ".join(does.split()), label=f"  {name}", indent=indent))
+    return "\n".join(lines)
 
 
 def _description(settings: type) -> str:
-    """Returns what a command does, of the docstring of its settings, in lines of the terminal's width."""
+    """Returns what the docstring of settings says of their command, in lines of the terminal's width."""
     from inspect import getdoc
 
     from experiments.terminal import wrapped
@@ -151,16 +133,12 @@ def _description(settings: type) -> str:
 
 
 def _sentence(error: Exception) -> str:
-    """Returns an error as one line; only unexpected errors show their type.
-
-    What it quotes of a file is shown, and means nothing to a terminal.
-    """
+    """Returns an error as one printable line; only unexpected errors show their type."""
     from ncs_gym.validation import printable
 
     ours = type(error).__module__.partition(".")[0] == "experiments"
     if isinstance(error, OSError) and error.strerror:
         text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
-        text += f"; {_REMEDIES[error.errno]}" if error.errno in _REMEDIES else ""
     elif ours or isinstance(error, (ValueError, OSError, ImportError)):
         text = str(error)
     else:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from agents.results import TrainingStopped
-
 
 class OtherResultsError(ValueError):
     """An output folder holds results of other settings, which would be replaced."""
@@ -20,7 +18,7 @@ class RunError(RuntimeError):
         return cls(f"run {name}: {type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)")
 
 
-class RunStopped(TrainingStopped):
+class RunStopped(RuntimeError):
     """A training run gave up because another run failed or the user interrupted."""
 
 

@@ -78,20 +78,32 @@ def require_horizon(settings: Any, *modes: str | None) -> None:
         raise ValueError(f"--horizon {settings.horizon} is for mode lookahead, which is not asked for")
 
 
-def require_one_plant(settings: Any) -> None:
-    """Raises ValueError if both an environment and the file of a plant are given."""
-    if settings.env is not None and settings.plant is not None:
-        raise ValueError("give either --env or --plant, not both")
-
-
 def short_version(settings: Any, **budget: Any) -> Any:
-    """Returns the settings of a command's short version if `--smoke` is given, otherwise the same settings."""
+    """Returns the settings of a command's short version if `--smoke` is given, else the same."""
     if not settings.smoke:
         return settings
     default = type(settings).out
-    if settings.out is not None and settings.out == default:  # what the whole version leaves there stays
+    if settings.out == default:  # what the whole version leaves there stays
         budget["out"] = default.with_stem(f"{default.stem}-smoke")
     return replace(settings, **budget)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlantSettings:
+    """Which plant a command is about.
+
+    Attributes:
+        env: Id of an environment with a plant of its own; module:id imports the module first, which registers one of
+            yours (`ncs_gym.register_plant`).
+        plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
+    """
+
+    env: str | None = None
+    plant: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.env is not None and self.plant is not None:
+            raise ValueError("give either --env or --plant, not both")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +150,7 @@ class LearningSettings(BackendSettings):
 
     Attributes:
         env: Id of an environment with a plant; module:id imports the module first.
-        seed: Seed of the experiment, >= 0.
+        seed: Seed of the experiment.
         steps: Training steps per run, in whole rollouts; by default those tuned for the environment, or 150,000, and
             of several algorithms the most.
         episodes: Evaluation episodes per run.
@@ -155,7 +167,7 @@ class LearningSettings(BackendSettings):
             max_consecutive_losses.
         hyperparams: Hyperparameters in the words of stable-baselines3, such as gamma=0.99 or
             'policy_kwargs={"net_arch": [64]}'; others are tuned for the environment, or the default.
-        lagrangian: How the arm "lagrangian" adapts its penalty per violating step; no option of the command line.
+        lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
         smoke: Run a short version to see that everything works, by default in a folder with -smoke in its name.
         force: Replace results of other settings in the output folder.
     """
@@ -188,28 +200,19 @@ class LearningSettings(BackendSettings):
         """All hyperparameters of the algorithm: those given, those tuned, the defaults."""
         given, defaults = self.hyperparams, DEFAULTS[self.algorithm]
         tuned = None if given.keys() >= defaults.keys() else tuned_hyperparams(id_alone(self.env), self.algorithm)
-        found = with_changes(with_changes(defaults, tuned or {}), given)
-        return {name: value for name, value in found.items() if name != "n_timesteps"}
+        return with_changes(with_changes(defaults, tuned or {}), given)
 
     @property
     def training_steps(self) -> int:
-        """Training steps per run: those given, or those that belong to the hyperparameters.
-
-        Raises:
-            ValueError: If the hyperparameter `n_timesteps` is no number of steps.
-        """
+        """Training steps per run: those given, or those tuned for the environment."""
         if self.steps is not None:
             return self.steps
-        tuned = max(tuned_steps(id_alone(self.env), algorithm) or _DEFAULT_STEPS for algorithm in self.algorithms)
-        steps = self.hyperparams.get("n_timesteps", tuned)
-        if type(steps) not in (int, float) or not 1 <= steps < 1e15 or steps != int(steps):
-            raise ValueError(f"n_timesteps must be a whole number >= 1, got {shown(steps)}")
-        return int(steps)
+        return max(tuned_steps(id_alone(self.env), algorithm) or _DEFAULT_STEPS for algorithm in self.algorithms)
 
     @property
     def agent_line(self) -> str:
-        """One line with all hyperparameters of the algorithm and where they come from."""
-        found, given = self.all_hyperparams, self.hyperparams.keys() - {"n_timesteps"}
+        """All hyperparameters of the algorithm and where they come from, in one line."""
+        found, given = self.all_hyperparams, self.hyperparams.keys()
         is_tuned = tuned_hyperparams(id_alone(self.env), self.algorithm) is not None
         source = f"hyperparameters tuned for {id_alone(self.env)}" if is_tuned else "default hyperparameters"
         if given == found.keys():

@@ -24,10 +24,9 @@ def text_table(rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), lef
     """Returns rows of cells as aligned text; columns that would make it wider than 80 stand closer together.
 
     Args:
-        rows: Rows of equal length, the header first; a row of a single cell is a title, which may be wider than its
-            column, of the rows below it.
+        rows: Rows of equal length, the header first; a row of a single cell is a title of the rows below it.
         rules: Indices of the rows above which a horizontal rule is drawn.
-        left_columns: Number of columns that are aligned to the left; the others are aligned to the right.
+        left_columns: How many columns are aligned to the left.
     """
     widths = [max(map(len, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
     gap = 2 if sum(widths) + 2 * (len(widths) - 1) <= GREATEST_WIDTH else 1
@@ -40,25 +39,17 @@ def text_table(rows: Sequence[Sequence[str]], rules: Collection[int] = (1,), lef
     return "\n".join(lines)
 
 
-def terminal_width() -> int:
-    """Returns how wide lines of prose may be [characters]."""
-    columns = shutil.get_terminal_size((GREATEST_WIDTH, 24)).columns
-    return min(max(columns, _LEAST_WIDTH), GREATEST_WIDTH)
-
-
-def wrapped(text: str, width: int | None = None, *, label: str = "", indent: int = 2) -> str:
-    """Returns a text in lines of at most some width; only a longer word makes a line longer.
-
-    A number and its percent sign stay on one line.
+def wrapped(text: str, *, label: str = "", indent: int = 2) -> str:
+    """Returns a text in lines of the terminal's width; a longer word, or a number and its percent sign, stay whole.
 
     Args:
         text: The text, on one line.
-        width: Greatest width of a line [characters]; by default that of the terminal.
         label: What stands in front of the text.
         indent: Column in which the second and later lines begin, and the first one if there is a label.
     """
+    columns = shutil.get_terminal_size((GREATEST_WIDTH, 24)).columns
     wrapper = TextWrapper(
-        terminal_width() if width is None else width,
+        min(max(columns, _LEAST_WIDTH), GREATEST_WIDTH),
         initial_indent=label and label.ljust(indent),
         subsequent_indent=" " * indent,
         break_on_hyphens=False,
@@ -68,30 +59,23 @@ def wrapped(text: str, width: int | None = None, *, label: str = "", indent: int
 
 
 def say(line: str, indent: int = 2) -> None:
-    """Prints a message on stderr, above a progress bar if there is one; on a terminal in lines of its width."""
+    """Prints a message on stderr, above a progress bar; on a terminal in lines of its width."""
     from tqdm import tqdm  # only where there is something to say: `ncs --help` starts sooner
 
     tqdm.write(wrapped(line, indent=indent) if sys.stderr.isatty() else line, file=sys.stderr)
 
 
-def progress_bar(total: int, description: str, unit: str) -> tqdm:
-    """Returns a progress bar on stderr: a line that changes on a terminal, in a file a line of its own now and then.
-
-    Args:
-        total: Count at the end.
-        description: What goes on.
-        unit: What is counted; an empty string if the count says nothing to people, who then see the share alone.
-    """
+def progress_bar(steps: int, description: str) -> tqdm:
+    """Returns a progress bar on stderr: a line that changes on a terminal, in a file a line of its own now and then."""
     from tqdm import tqdm
 
     is_terminal = sys.stderr.isatty()
-    count, rate = (" {n_fmt}/{total_fmt}", ", {rate_noinv_fmt}") if unit else ("", "")
     return tqdm(
-        total=total,
+        total=steps,
         desc=description,
-        unit=f" {unit}",
+        unit=" step",
         unit_scale=True,
-        bar_format=f"{{l_bar}}{{bar}}|{count} [{{elapsed}}<{{remaining}}{rate}]",
+        bar_format="{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}, {rate_noinv_fmt}]",
         mininterval=_TERMINAL_PERIOD if is_terminal else _FILE_PERIOD,
         miniters=0,
         file=sys.stderr if is_terminal else _Lines(),
@@ -111,7 +95,7 @@ class _Lines:
 
 @contextmanager
 def warnings_as_sentences() -> Iterator[None]:
-    """Prints the text of each warning once on stderr, without the file and the line of code that it comes from."""
+    """Prints the text of each warning once on stderr."""
     shown: set[str] = set()
 
     def show(message: Warning | str, *origin: Any, **more: Any) -> None:
@@ -126,14 +110,13 @@ def warnings_as_sentences() -> Iterator[None]:
 
 @contextmanager
 def warnings_sent(send: Callable[[str], object]) -> Iterator[None]:
-    """Sends the text of each warning, for instance from a worker process to where the progress bar is."""
+    """Sends the text of each warning."""
     with _shown_by(lambda message, *origin, **more: send(str(message))):
         yield
 
 
 @contextmanager
 def _shown_by(show: Callable[..., object]) -> Iterator[None]:
-    """Has warnings shown by a function; which ones are shown stays as it is."""
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield

@@ -8,9 +8,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
@@ -82,24 +81,6 @@ def assert_one_sentence(run, *words):
     assert len(lines) == 1, run.stderr
     assert lines[0].startswith("ncs: ")
     assert all(word in lines[0] for word in words), lines[0]
-
-
-def killed(*arguments, once: Callable[[], bool]) -> None:
-    """Starts `ncs` in a process of its own, kills it in its work, and waits until none of its workers is left."""
-    command = [sys.executable, "-m", "experiments", *map(str, arguments)]
-    run = subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 200.0
-    while not once():
-        assert run.poll() is None, "it ended before it was killed"
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    children = children_of(run.pid)
-    assert len(children) >= 2
-    run.kill()
-    run.wait()
-    while any(is_alive(child) for child in children):
-        assert time.monotonic() < deadline, "workers outlive their parent"
-        time.sleep(0.1)
 
 
 def children_of(pid: int) -> list[int]:

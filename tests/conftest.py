@@ -11,7 +11,6 @@ import os
 import shutil
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import is_dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -22,7 +21,6 @@ from unittest import mock
 # Read when numpy is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import numpy as np
 import pytest
 
 if TYPE_CHECKING:
@@ -32,15 +30,7 @@ if TYPE_CHECKING:
 # Gymnasium's checker tries every render mode: no windows while tests run.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
-LONGEST_ID = 50
 SLOWEST = 25
-
-
-def pytest_make_parametrize_id(val: Any) -> str | None:
-    """Ids say what is tried, where pytest would only count: values of lists, arrays and settings."""
-    if isinstance(val, dict | list | tuple | np.ndarray) or is_dataclass(val):
-        return _shown(val)[:LONGEST_ID]
-    return None
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -109,19 +99,6 @@ class ProcessorTimes:
 def processor_seconds() -> float:
     """Processor time of this process and of the ended processes that it started [s]."""
     return sum(os.times()[:4])
-
-
-def _shown(value: Any) -> str:
-    """A value in few words, the same in every process."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return ",".join(f"{_shown(key)}={_shown(each)}" for key, each in value.items()) or "none"
-    if isinstance(value, list | tuple):
-        return " ".join(map(_shown, value)) or "none"
-    if isinstance(value, str | int | float | complex | None):
-        return str(value)
-    return getattr(value, "__name__", type(value).__name__)
 
 
 @pytest.fixture(scope="session")

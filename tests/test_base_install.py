@@ -31,12 +31,7 @@ def run(binary, *arguments, cwd):
     return subprocess.run([str(binary), *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=600)
 
 
-def test_nothing_of_the_extras_is_installed(binaries, tmp_path):
-    code = "import importlib.util as u; print([n for n in ('torch', 'stable_baselines3', 'pygame') if u.find_spec(n)])"
-    assert run(binaries / "python", "-c", code, cwd=tmp_path).stdout.strip() == "[]"
-
-
-def test_environments_and_shields_work(binaries, tmp_path):
+def test_environments_shields_and_commands_about_certificates_work(binaries, tmp_path):
     code = """
 import gymnasium, numpy, ncs_gym, shields, agents
 env = shields.SafetyShield(gymnasium.make("ncs_gym/TruckTrailerCruise-v0"))
@@ -48,38 +43,20 @@ print(envs.step(numpy.ones((3, 1), numpy.float32))[4]["episode_violations"].sum(
 """
     result = run(binaries / "python", "-c", code, cwd=tmp_path)
     assert result.stdout.split() == ["0.0", "0.0"], result.stderr
-
-
-def test_commands_about_certificates_work(binaries, tmp_path):
     file = tmp_path / "c.json"
-    for arguments in (["synthesize", "--out", file], ["verify", file], ["audit"]):
+    for arguments in (["synthesize", "--out", file], ["verify", file], ["paper"]):
         result = run(binaries / "ncs", *arguments, cwd=tmp_path)
         assert result.returncode == 0, result.stderr
 
 
-@pytest.mark.parametrize(
-    ("arguments", "extra"),
-    [
-        (["compare"], "train"),
-        (["train"], "train"),
-        (["evaluate", "x"], "train"),
-        (["sweep"], "train"),
-        (["render"], "render"),
-    ],
-)
-def test_commands_that_need_an_extra_say_so_in_one_sentence(binaries, tmp_path, arguments, extra):
-    result = run(binaries / "ncs", *arguments, cwd=tmp_path)
-    assert result.returncode == 2
-    (line,) = result.stderr.strip().splitlines()
-    assert line.endswith(f": pip install 'ncs-gym[{extra}]'")
-
-
-def test_training_adapter_says_what_is_missing(binaries, tmp_path):
-    result = run(binaries / "python", "-c", "from agents import SB3VecEnv", cwd=tmp_path)
-    assert result.returncode == 1
-    last = result.stderr.splitlines()[-1]
-    assert "agents.SB3VecEnv needs stable_baselines3 and torch" in last
-    assert "train" in last.partition("is not installed: ")[2]
+def test_what_needs_an_extra_says_so_in_one_sentence(binaries, tmp_path):
+    for command, extra in {"compare": "train", "train": "train", "sweep": "train", "render": "render"}.items():
+        result = run(binaries / "ncs", command, cwd=tmp_path)
+        assert result.returncode == 2
+        (line,) = result.stderr.strip().splitlines()
+        assert line.endswith(f": pip install 'ncs-gym[{extra}]'")
+    last = run(binaries / "python", "-c", "from agents import SB3VecEnv", cwd=tmp_path).stderr.splitlines()[-1]
+    assert "agents.SB3VecEnv needs stable_baselines3 and torch, and " in last
 
 
 def test_declared_versions_are_those_tested():

@@ -92,28 +92,6 @@ def test_relative_links_lead_to_files(page):
             assert (page.parent / target.partition("#")[0]).exists(), target
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_tables_have_a_header_and_no_gap(page):
-    for table in re.findall(r"(?:^\|.*\n)+", CODE.sub("", page.read_text()), re.MULTILINE):
-        assert re.fullmatch(r"\|(?:-+\|)+", table.splitlines()[1]), table
-
-
-def test_messages_and_help_name_pages_as_the_navigation_calls_them():
-    named, files = set(), []
-    for path in (path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
-        text = path.read_text()
-        named |= {" ".join(name.split()) for name in re.findall(r"documentation\s+under[\s\"']+([^\"]+)\"", text)}
-        nodes = list(ast.walk(ast.parse(text)))
-        documented = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
-        texts = [node for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
-        said = [node.value for node in texts if id(node) not in documented]
-        files += [text for text in said if re.search(r"docs/\w+\.md", text) and " " in text]
-    navigation = (ROOT / "mkdocs.yml").read_text()
-    assert named
-    assert [name for name in named if f"- {name}: " not in navigation] == []
-    assert files == []
-
-
 def test_navigation_has_every_page_once():
     nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
     pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
@@ -153,18 +131,15 @@ def test_table_of_errors_has_every_exception_class_and_no_other():
         assert all(base.__name__ in vars(builtins) or base in map(resolved, listed) for base in error.__bases__)
 
 
-def test_examples_that_the_pages_name_exist():
-    named = {path for page in PAGES for path in re.findall(r"examples/[\w/]+\.(?:py|yml|txt)", page.read_text())}
-    assert "examples/single_file_ppo.py" in named
+def test_modules_and_functions_that_the_pages_name_exist():
+    text = "".join(page.read_text() for page in PAGES if page.name != "CHANGELOG.md")  # which names what there was
+    named = {*MODULE.findall(text), *re.findall(r"examples/[\w/]+\.(?:py|yml|txt)", text)}
+    assert {"examples/single_file_ppo.py", "shields/runtime/safety_filter.py"} <= named
     assert [path for path in named if not (ROOT / path).exists()] == []
-
-
-def test_modules_that_the_pages_name_exist():
-    # The changelog names what there was.
-    pages = [page for page in PAGES if page.name != "CHANGELOG.md"]
-    named = {path for page in pages for path in MODULE.findall(page.read_text())}
-    assert "shields/runtime/safety_filter.py" in named
-    assert [path for path in named if not (ROOT / path).exists()] == []
+    functions = re.findall(r"`(\w+)` in `([\w/]+\.py)`", (ROOT / "docs" / "architecture.md").read_text())
+    assert ("transmit", "ncs_gym/network/packet_loss_and_delay.py") in functions
+    for name, path in functions:
+        assert re.search(rf"^\s*(?:def|class) {name}\b", (ROOT / path).read_text(), re.MULTILINE), (name, path)
 
 
 def test_architecture_describes_every_folder_and_no_other():
@@ -172,14 +147,6 @@ def test_architecture_describes_every_folder_and_no_other():
     described = re.findall(rf"^\| `((?:{'|'.join(PACKAGES)})(?:/\w+)*)` \|", page, re.MULTILINE)
     folders = {path.parent.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
     assert sorted(described) == sorted(str(folder) for folder in folders)
-
-
-def test_functions_that_architecture_names_exist():
-    page = (ROOT / "docs" / "architecture.md").read_text()
-    named = re.findall(r"`(\w+)` in `([\w/]+\.py)`", page)
-    assert ("transmit", "ncs_gym/network/packet_loss_and_delay.py") in named
-    for name, path in named:
-        assert re.search(rf"^\s*(?:def|class) {name}\b", (ROOT / path).read_text(), re.MULTILINE), (name, path)
 
 
 @pytest.mark.cases(2)

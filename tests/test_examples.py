@@ -1,6 +1,5 @@
 """Every example runs as it is, with a tiny budget, and prints what it is about."""
 
-import ast
 import importlib.util
 import re
 import subprocess
@@ -127,11 +126,11 @@ TRAINING = {
 # They synthesize certificates, or simulate an hour: in processes of their own, of `make test-slow`, alone.
 LONG = {"both_directions.py", "lost_hour.py", "mpc_loop.py", "quadruple_tank.py", "servo_requirements.py"}
 LONG |= {"unstable_plant_loop.py"}
-# Packages that no extra installs, and the versions that the examples were tried with (docs/agents.md).
+# Packages that no extra installs.
 FOREIGN = {
-    "minari_dataset.py": {"minari": "0.5.4", "jax": None, "h5py": None},
-    "tianshou_processes.py": {"tianshou": "2.0.1"},
-    "torchrl_rollout.py": {"torchrl": "0.14.1"},
+    "minari_dataset.py": ("minari", "jax", "h5py"),
+    "tianshou_processes.py": ("tianshou",),
+    "torchrl_rollout.py": ("torchrl",),
 }
 
 
@@ -142,26 +141,6 @@ def run_example(name, *arguments, cwd, **variables):
 
 def test_every_example_is_run_here():
     assert {path.name for path in (ROOT / "examples").glob("*.py")} == set(RUNS)
-
-
-def test_every_example_says_how_long_it_takes():
-    for name in RUNS:
-        text = ast.get_docstring(ast.parse((ROOT / "examples" / name).read_text()))
-        assert re.search(r"^Takes about .* (seconds?) on one core", text, re.MULTILINE), name
-
-
-def test_examples_that_train_compute_with_one_thread():
-    """Those that take their environments from `agents` do so by that; where others train, a line says it."""
-    for name in TRAINING | {"single_file_ppo.py", "torch_tensors.py"}:
-        text = (ROOT / "examples" / name).read_text()
-        assert ("from agents import" in text) != ("torch.set_num_threads(1)" in text), name
-
-
-def test_versions_of_foreign_packages_are_those_that_the_page_names():
-    page = (ROOT / "docs" / "agents.md").read_text()
-    for name, packages in FOREIGN.items():
-        (row,) = (line for line in page.splitlines() if name in line)
-        assert all(version in row for version in packages.values() if version)
 
 
 @pytest.mark.cases(2)
@@ -179,24 +158,6 @@ def test_example_runs_in_a_process_of_its_own_and_prints_what_it_is_about(name, 
     run = run_example(name, *RUNS[name][0], cwd=tmp_path, MINARI_DATASETS_PATH=str(tmp_path))
     assert run.returncode == 0, run.stderr
     assert_expected(name, run.stdout)
-
-
-LOGGERS = {
-    "mlflow": ("3.17.2", r"MLflow: safety/violation_rate 0\.000 safety/intervention_rate 0\.[1-9]"),
-    "wandb": ("0.31.0", r"wandb: +safety/violation_rate 0\n[\s\S]*W&B: logs/wandb/offline-run-"),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("package", LOGGERS)
-def test_loggers_that_are_installed_get_what_tensorboard_gets(package, tmp_path):
-    version, pattern = LOGGERS[package]
-    assert version in (ROOT / "docs" / "agents.md").read_text()
-    if importlib.util.find_spec(package) is None:
-        pytest.skip(f"{package} not installed: a virtual environment of its own (docs/agents.md)")
-    run = run_example("loggers.py", *RUNS["loggers.py"][0], cwd=tmp_path)
-    assert run.returncode == 0, run.stderr
-    assert re.search(pattern, run.stderr + run.stdout)
 
 
 def assert_expected(name, printed):

@@ -49,10 +49,3 @@ def test_nothing_but_refusals_goes_past_the_door():
     found = {path.relative_to(TESTS).as_posix(): past_the_door(path.read_text()) for path in TESTS.rglob("*.py")}
     assert all(found.pop(name) for name in OWN_REFUSALS | {"product.py"})
     assert {name: lines for name, lines in found.items() if lines} == {}
-
-
-def test_every_way_past_the_door_is_found():
-    ways = """LinearPlant(**given); ncs_gym.NCSEnv(plant); partial(SafetyShield, env)
-        from shields.paper import synthesize as own; shields.synthesize(plant); ncs_gym.family(plants)
-        replace(plant, limits=limits); gym.make("ncs_gym/LinearNCS-v0", plant=plant)"""
-    assert all(past_the_door(way.strip()) for line in ways.splitlines() for way in line.split(";"))

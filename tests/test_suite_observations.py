@@ -6,8 +6,8 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from benchmarks.suite_observations import Remembered, Shown
-from experiments.baselines import tuned_weights
 from experiments.baselines.observer import DisturbanceObserver
+from experiments.baselines.tuned import tuned_weights
 from ncs_gym.envs.env import ncs_env
 
 CASE = "ncs_gym/CSTR-v0"

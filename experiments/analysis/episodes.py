@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import pandas as pd
@@ -12,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from agents.hyperparams import ALGORITHMS
+from agents.results import Episode, TrainingPoint
 from experiments.analysis.statistics import bootstrap_interval, clopper_pearson, interquartile_mean, mean_interval
 from experiments.runs.arms import Arm, by_arm, is_shield
 from experiments.runs.loops import AS_TRAINED
@@ -20,47 +22,34 @@ from experiments.runs.training_run import RunResult
 # Key of the metadata in a file, and entries of summary.json that it holds.
 _METADATA = b"ncs-gym"
 _ORIGIN = ("settings", "seeds", "plant", "certificate", "certificate_file", "versions")
-# Columns of the tables, named as printed, by the fields of an episode and of a point of a training.
-_OF_EPISODE = {
+# Fields of episodes and of points of a training whose columns have other names.
+_COLUMNS = {
     "index": "episode",
-    "steps": "steps",
     "episode_return": "return",
     "violation_steps": "violating_steps",
     "estimate_violation_steps": "estimate_violating_steps",
     "interventions": "overridden",
-    "times_safe_set": "times_safe_set",
     "planned": "from_plan",
     "guaranteed": "proof_held",
     "proved": "proved_steps",
-}
-_OF_TRAINING = {
-    "steps": "steps",
-    "episode_return": "return",
-    "violation_steps": "violating_steps",
-    "interventions": "overridden",
     "multiplier": "price",
 }
 
 
 def episodes_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
-    """Returns a row per evaluation episode; docs/experiments.md explains the columns.
-
-    Args:
-        results: Results of training runs.
-        **common: Columns with the same value in all rows: the environment, the algorithm, what a sweep varies. An arm
-            with an algorithm of its own has that.
-    """
+    """Returns a row per evaluation episode, with `common` values in all; docs/experiments.md has the columns."""
     rows = [
-        common
-        | _of_arm(result.arm)
-        | {"run": result.index, "scenario": scenario}
-        | {column: getattr(episode, name) for name, column in _OF_EPISODE.items()}
+        common | _of_arm(result.arm) | {"run": result.index, "scenario": scenario} | _columns(episode)
         for result in results
         for scenario, played in ({AS_TRAINED: result.episodes} | result.scenarios).items()
         for episode in played
     ]
     table = pd.DataFrame(rows)
     return table.assign(violating=table["violating_steps"] > 0, outside_S=~(table["times_safe_set"] <= 1.0))
+
+
+def _columns(row: Episode | TrainingPoint) -> dict[str, Any]:
+    return {_COLUMNS.get(name, name): value for name, value in vars(row).items()}
 
 
 def _of_arm(name: str) -> dict[str, str]:
@@ -72,18 +61,16 @@ def _of_arm(name: str) -> dict[str, str]:
 def training_table(results: Iterable[RunResult], **common: Any) -> pd.DataFrame:
     """Returns a row per point of a training's history, with totals so far; docs/experiments.md explains the columns."""
     rows = [
-        common
-        | _of_arm(result.arm)
-        | {"run": result.index}
-        | {column: getattr(point, name) for name, column in _OF_TRAINING.items()}
+        common | _of_arm(result.arm) | {"run": result.index} | _columns(point)
         for result in results
         for point in result.history
     ]
-    return pd.DataFrame(rows, columns=[*common, "arm", "run", *_OF_TRAINING.values()])
+    columns = [_COLUMNS.get(each.name, each.name) for each in fields(TrainingPoint)]  # of no rows, too
+    return pd.DataFrame(rows, columns=[*common, "arm", "run", *columns])
 
 
 def parquet(table: pd.DataFrame, summary: Mapping[str, Any]) -> bytes:
-    """Returns a table as the content of a Parquet file, whose metadata say where it comes from."""
+    """Returns a table as a Parquet file, whose metadata say where it comes from."""
     origin = {name: summary[name] for name in _ORIGIN if name in summary}
     content = pa.Table.from_pandas(table, preserve_index=False)
     buffer = io.BytesIO()
@@ -98,7 +85,7 @@ _AVERAGED = ["return", "violating", "outside_S"]
 
 
 def arm_summaries(results: Sequence[RunResult], mode: str) -> dict[str, dict[str, Any]]:
-    """Returns what `arm_summary` says of every arm, by its name and in the order of the results."""
+    """Returns the summary of every arm by its name, in the order of the results."""
     summaries = {}
     for name, runs in by_arm(results).items():
         arm = Arm.of(name, mode)
@@ -110,23 +97,14 @@ def arm_summaries(results: Sequence[RunResult], mode: str) -> dict[str, dict[str
 def arm_summary(
     results: Sequence[RunResult], mode: str | None, *, fixed_policy: bool, filters_training: bool = True
 ) -> dict[str, Any]:
-    """Returns the summary of an arm, JSON values only.
+    """Returns the summary of an arm by the results of its runs and parts of its `Arm`, JSON values only.
 
     `eval_violation_rate_ci95` is the Clopper-Pearson interval of the probability that an episode violates, given the
-    trained policies. `eval_violation_steps` counts violating steps of the true state and
-    `eval_estimate_violation_steps` those of the estimate; they are plain counts, because the steps of one episode are
-    dependent. `eval_return_ci95` is Student's interval over the mean returns of the runs (null for a single run),
-    because training differs from run to run; for a policy that is the same in all runs (`fixed_policy`) it is over the
-    episodes. The bootstrap intervals are over the same values. `eval_episodes_outside_set` counts episodes in which the
-    true state left the safe set. `plan_rate` is the share of steps that live from a plan: after whose decision inputs
-    of a certified plan are in store (mode "lookahead", 0 in others). `eval_proved_steps` counts steps after which the
-    guarantee held. `conditions` holds the same numbers of the evaluation in each other scenario.
-
-    Args:
-        results: Results of the arm's runs, in their order.
-        mode: Mode of its shield, or name of its other filter; None for neither.
-        fixed_policy: Whether the policy is the same in all runs.
-        filters_training: Whether the shield or filter acts in training, too.
+    trained policies. `eval_violation_steps` and `eval_estimate_violation_steps` are plain counts, because the steps of
+    one episode are dependent. `eval_return_ci95` is Student's interval over the mean returns of the runs (null for a
+    single run), because training differs from run to run; for a policy that is the same in all runs (`fixed_policy`) it
+    is over the episodes. The bootstrap intervals are over the same values. `plan_rate` is the share of steps that are
+    executed from a stored plan (mode "lookahead"). `conditions` holds the same numbers for each other scenario.
     """
     steps = sum(result.train_steps for result in results)
     violations = [result.train_violation_steps for result in results]
@@ -184,9 +162,8 @@ def _evaluated(episodes: pd.DataFrame, *, fixed_policy: bool) -> dict[str, Any]:
 def paired_differences(episodes: pd.DataFrame, baseline: str) -> dict[str, Any]:
     """Returns the differences between each other arm and the baseline, JSON values.
 
-    They are the mean differences of returns in episodes with the same numbers, with Student's and the bootstrap's
-    interval over the runs, or over the episodes where both policies are the same in all runs (`return_ci95_over`), and
-    the differences of the numbers of violating episodes.
+    Returns differ in the mean over episodes with the same numbers; intervals are over the runs, or over the episodes
+    where both policies are the same in all runs (`return_ci95_over`).
     """
     as_trained = episodes[episodes["scenario"] == AS_TRAINED]
     differences = {}

@@ -17,12 +17,7 @@ _ALL_UP_TO, _OF_A_DECADE = 10, (2, 5, 10)
 
 
 def stalls(ages: np.ndarray, max_age: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where stretches of older samples begin, and how long each is, shape (stalls,) each [steps].
-
-    Args:
-        ages: Age of the newest sample at every step, shape (k,) [steps].
-        max_age: The oldest age that is no stall [steps].
-    """
+    """Returns where ages, shape (k,), are larger than `max_age`, and for how long each, shape (stalls,) [steps]."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (ages > max_age).astype(np.int8), [0]])))
     return edges[::2], edges[1::2] - edges[::2]
 
@@ -30,16 +25,12 @@ def stalls(ages: np.ndarray, max_age: int) -> tuple[np.ndarray, np.ndarray]:
 def count_interval(starts: np.ndarray, steps: int) -> tuple[float, float]:
     """Returns a 95 % interval for the expected number of stalls in a record as long as this one.
 
-    Stalls come in clusters, so they are not taken for independent. The record is cut into 4, 8, 16, ... equal parts,
-    and D is the largest ratio of variance to mean of the numbers of stalls in these parts, at least 1, as of
-    independent stalls. The n stalls then count as n / D independent clusters of D stalls (quasi-Poisson), for which the
-    interval is Garwood's: D times the quantiles of chi-square with 2 n / D and 2 n / D + 2 degrees of freedom, halved.
-    It assumes that the network goes on as in the record, that clusters are shorter than a quarter of it, and that the
-    record has some of the large ones: of heavy-tailed clusters it needs twenty or more.
-
-    Args:
-        starts: Steps at which stalls begin, shape (n,).
-        steps: Length of the record.
+    Stalls, which begin at the steps `starts`, shape (n,), come in clusters. The record is cut into 4, 8, 16, ... equal
+    parts, and D is the largest ratio of variance to mean of the numbers of stalls in these parts, at least 1. The n
+    stalls then count as n / D independent clusters of D stalls (quasi-Poisson), for which the interval is Garwood's: D
+    times the quantiles of chi-square with 2 n / D and 2 n / D + 2 degrees of freedom, halved. It assumes that the
+    network goes on as in the record, that clusters are shorter than a quarter of it, and that the record has some of
+    the large ones: of heavy-tailed clusters it needs twenty or more.
     """
     spread, parts = 1.0, _FEWEST_PARTS
     while len(starts) and parts <= min(_MOST_PARTS, steps):
@@ -59,8 +50,7 @@ def broken_contracts(ages: np.ndarray, dt: float, also: Collection[int] = ()) ->
         also: Values of `max_age` that are among them.
 
     Returns:
-        Rows of JSON values, from the age that was kept, or the largest a contract can have, down to 0: all ages up to
-        10 and some larger ones.
+        Rows of JSON values by falling age: all ages up to 10 and some larger ones.
     """
     largest, steps = min(int(ages.max()), MAX_AGE), len(ages)
     decades = (10**power * each for power in (1, 2) for each in _OF_A_DECADE)

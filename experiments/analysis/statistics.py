@@ -42,13 +42,9 @@ def interquartile_mean(values: Values, axis: int = -1) -> float:
 
 
 def bootstrap_interval(values: Values, statistic: Callable[..., float] = np.mean) -> list[float] | None:
-    """Returns the percentile bootstrap's 95 % interval of a statistic of values; None for fewer than two.
+    """Returns the percentile bootstrap's 95 % interval of a statistic of independent values; None for fewer than two.
 
     With a handful of values it is too narrow: it cannot reach beyond the smallest and the largest of them.
-
-    Args:
-        values: Independent values.
-        statistic: Function of an array of resampled values and the `axis` over which it is computed.
     """
     if len(values) < 2:
         return None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
+import re
 import signal
 import threading
 import warnings
@@ -11,31 +13,29 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
+from agents.agent_file import AGENT_FILES
 from experiments.errors import ClusterError, RunError, RunStopped
-from experiments.runs.output_folder import file_name, load, save
+from experiments.runs.training_run import RunResult, TrainingRun
 from experiments.settings import BackendSettings
 from experiments.terminal import progress_bar, say, warnings_sent
+from shields.atomic_write import write_atomically
 
 # How often the bar moves [s].
 _PERIOD = 0.5
 # What executes a run of some number elsewhere: its future result is that of `executed`. Beside it stands the error of a
 # future whose worker died.
-Engine = tuple[Callable[[int, Any], Future[tuple[Any, list[str]]]], type[Exception]]
+Engine = tuple[Callable[[int, TrainingRun], Future[tuple[RunResult, list[str]]]], type[Exception]]
 
 
-def results_of(runs: Sequence[Any], folder: Path, settings: BackendSettings) -> list[Any]:
-    """Returns the results of all runs, in their order; each is stored when it is finished.
+def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSettings) -> list[RunResult]:
+    """Returns the results of runs of different names, in their order; each is stored when it is finished.
 
-    Args:
-        runs: `TrainingRun`s of different names. Those whose results are in the folder are not executed again.
-        folder: Output folder.
-        settings: Where they are executed.
+    Those whose results are in the folder already are not executed again.
 
     Raises:
         RunError: If a run fails, which stops the others, or workers died, which costs their own runs only.
@@ -49,31 +49,64 @@ def results_of(runs: Sequence[Any], folder: Path, settings: BackendSettings) -> 
     if results:
         say(f"{len(results)} of {len(runs)} runs were finished before")
 
-    def keep(run: Any, result: Any) -> None:
+    def keep(run: TrainingRun, result: RunResult) -> None:
         save(folder, run, result)
         results[run.name] = result
-        if result.outcome:
-            say(f"{run.name}: {result.outcome}")
+        say(f"{run.name}: {result.outcome}")
 
     if missing:
         counts = multiprocessing.get_context("spawn").RawArray("q", len(missing) + 1)
-        execute(missing, counts, _engine(settings, len(missing), counts, folder / "tensorboard"), keep)
+        if settings.engine == "ray":
+            from experiments.backends.ray_tasks import ray_tasks  # needs the extra "ray"
+
+            where = ray_tasks(settings.ray_address)
+        else:
+            where = local_workers(min(settings.jobs, len(missing)), counts, folder / "tensorboard")
+        execute(missing, counts, where, keep)
     return [results[run.name] for run in runs]
 
 
-def _engine(settings: BackendSettings, runs: int, counts: Any, log_folder: Path) -> AbstractContextManager[Engine]:
-    """Returns where runs are executed; TensorBoard's events are left by workers of this machine alone."""
-    if settings.engine == "ray":
-        from experiments.backends.ray_tasks import ray_tasks  # needs the extra "ray"
+def file_name(run: TrainingRun) -> str:
+    """Returns the name of a run's file: its name, with hyphens for what is special in file names."""
+    return re.sub(r"[^\w.+-]+", "-", run.name) + ".json"
 
-        return ray_tasks(settings.ray_address)
-    return local_workers(min(settings.jobs, runs), counts, log_folder)
+
+def save(folder: Path, run: TrainingRun, result: RunResult) -> None:
+    """Writes the result of a run into `runs/NAME.json`, and before it the agent's files into `models/NAME/`."""
+    path, models = folder / "runs" / file_name(run), folder / "models" / run.name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)  # an older result must not stand for the newer agent
+    for name, content in result.files.items():
+        models.mkdir(parents=True, exist_ok=True)
+        write_atomically(models / name, content)
+    values = {name: value for name, value in asdict(result).items() if name != "files"}
+    write_atomically(path, json.dumps({"key": run.key, "result": values}) + "\n")
+
+
+def load(folder: Path, run: TrainingRun) -> RunResult | None:
+    """Returns the result of a run; None if there is none of its settings and versions, or not whole."""
+    path, models = folder / "runs" / file_name(run), folder / "models" / run.name
+    files = [models / name for name in AGENT_FILES] if run.trains else []
+    if not path.exists() or not all(file.is_file() for file in files):
+        return None
+    try:
+        document = json.loads(path.read_bytes())
+        if document["key"] != run.key:
+            return None
+        content = {file.name: file.read_bytes() for file in files}
+        return replace(RunResult.of_json(document["result"]), files=content)
+    except (OSError, LookupError, TypeError, ValueError, RecursionError):
+        say(f"{path} is damaged: its run is done again")
+        return None
 
 
 def execute(
-    runs: Sequence[Any], counts: Any, where: AbstractContextManager[Engine], keep: Callable[[Any, Any], object]
+    runs: Sequence[TrainingRun],
+    counts: Any,
+    where: AbstractContextManager[Engine],
+    keep: Callable[[TrainingRun, RunResult], object],
 ) -> None:
-    """Executes runs, and hands each result on when it is there; for errors see `results_of`.
+    """Executes runs and hands each result to `keep` when it is there; for errors see `results_of`.
 
     Args:
         runs: The runs.
@@ -82,7 +115,8 @@ def execute(
         keep: Takes a run and its result.
     """
     lost = []
-    with _bar(runs) as bar, where as (submit, worker_died):
+    what = "training and evaluation" if any(run.trains for run in runs) else "evaluation"
+    with progress_bar(sum(run.total_steps for run in runs), what) as bar, where as (submit, worker_died):
         numbers = {submit(number, run): number for number, run in enumerate(runs)}
         while numbers:
             finished, _ = wait(numbers, _PERIOD, FIRST_COMPLETED)
@@ -106,19 +140,10 @@ def execute(
         raise RunError(f"worker processes died in {', '.join(lost)}: the same command goes on with what is missing")
 
 
-def _bar(runs: Sequence[Any]) -> tqdm:
-    parts = " and ".join(sorted({part for run in runs for part in run.parts}, reverse=True))
-    return progress_bar(sum(run.total_steps for run in runs), parts, " and ".join({run.unit for run in runs}))
-
-
-def executed(run: Any, report: Callable[[int], None], log_folder: Path | None = None) -> tuple[Any, list[str]]:
-    """Returns the result of a run, and the texts of its warnings.
-
-    Args:
-        run: The run.
-        report: Called with numbers of steps taken.
-        log_folder: Folder in which it leaves TensorBoard's events; None for none.
-    """
+def executed(
+    run: TrainingRun, report: Callable[[int], None], log_folder: Path | None = None
+) -> tuple[RunResult, list[str]]:
+    """Returns the result of a run, and the texts of its warnings; for arguments see `TrainingRun.execute`."""
     texts: list[str] = []
     with warnings_sent(texts.append):
         return run.execute(report, log_folder), texts
@@ -128,14 +153,11 @@ def executed(run: Any, report: Callable[[int], None], log_folder: Path | None = 
 def local_workers(jobs: int, counts: Any, log_folder: Path | None = None) -> Iterator[Engine]:
     """Yields worker processes of this machine, each a pool of its own: one that dies breaks no other.
 
-    Args:
-        jobs: How many there are.
-        counts: Shared memory in which they count the steps of each run; its last entry tells them to stop.
-        log_folder: As for `executed`.
+    They count the steps of each run in `counts`, shared memory whose last entry tells them to stop.
     """
     context, pools, own = multiprocessing.get_context("spawn"), list[ProcessPoolExecutor](), threading.local()
 
-    def in_pool(number: int, run: Any) -> tuple[Any, list[str]]:
+    def in_pool(number: int, run: TrainingRun) -> tuple[RunResult, list[str]]:
         if not hasattr(own, "pool"):
             own.pool = ProcessPoolExecutor(1, context, _begin_worker, (counts,))
             pools.append(own.pool)
@@ -176,7 +198,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def _work(number: int, run: Any, log_folder: Path | None) -> tuple[Any, list[str]]:
+def _work(number: int, run: TrainingRun, log_folder: Path | None) -> tuple[RunResult, list[str]]:
     def report(steps: int) -> None:
         _counts[number] += steps
         if _counts[-1]:

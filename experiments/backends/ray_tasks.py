@@ -17,6 +17,7 @@ from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 from experiments.backends.execution import Engine, executed
 from experiments.errors import ClusterError
 from experiments.runs.provenance import versions
+from experiments.runs.training_run import RunResult, TrainingRun
 
 # How often Ray repeats a run whose worker died.
 RETRIES = 3
@@ -25,13 +26,9 @@ _SOURCE_FOLDER = Path(__file__).resolve().parents[2]
 
 @contextmanager
 def ray_tasks(address: str) -> Iterator[Engine]:
-    """Yields a cluster, with a core for each run, that counts a run's steps when it is finished.
+    """Yields a cluster, with a core for each run; raises ClusterError if it cannot be joined.
 
-    Args:
-        address: "local" starts a Ray that ends with this process, "auto" and HOST:PORT join one.
-
-    Raises:
-        ClusterError: If the cluster cannot be joined.
+    The address "local" starts a Ray that ends with this process, "auto" and HOST:PORT join one.
     """
     options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address == "local":
@@ -48,7 +45,7 @@ def ray_tasks(address: str) -> Iterator[Engine]:
             raise ClusterError(f"the cluster at --ray-address {address} cannot be joined: {error}") from error
         task = ray.remote(_on_node).options(num_cpus=1, max_retries=RETRIES, retry_exceptions=False)
 
-        def submit(number: int, run: Any) -> Future[tuple[Any, list[str]]]:
+        def submit(number: int, run: TrainingRun) -> Future[tuple[RunResult, list[str]]]:
             reference = task.remote(versions(), run)
             references[future := reference.future()] = reference
             future.add_done_callback(references.pop)  # a reference that is kept keeps its result in memory
@@ -63,7 +60,7 @@ def ray_tasks(address: str) -> Iterator[Engine]:
         ray.shutdown()
 
 
-def _on_node(expected: dict[str, str], run: Any) -> tuple[Any, list[str]]:
+def _on_node(expected: dict[str, str], run: TrainingRun) -> tuple[RunResult, list[str]]:
     """Returns what `executed` does on a node that has the driver's versions."""
     own = versions()
     if different := sorted(name for name in expected.keys() | own.keys() if expected.get(name) != own.get(name)):

@@ -41,17 +41,11 @@ Inputs = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class RegulatorWeights:
-    """What a linear-quadratic regulator weighs against an error of the task of one width.
+    """What a regulator weighs against an error of the task of one width."""
 
-    Attributes:
-        effort: An input at its limit; where the task prices changes of the input, a change by its limit.
-        state: A state at the edge of the box.
-        disturbance: alpha of `DisturbanceObserver`, for regulators with one.
-    """
-
-    effort: float = 0.01
-    state: float = 0.01
-    disturbance: float = 0.2
+    effort: float = 0.01  # an input at its limit; where the task prices changes of the input, a change by its limit
+    state: float = 0.01  # a state at the edge of the box
+    disturbance: float = 0.2  # alpha of `DisturbanceObserver`
 
 
 DEFAULT_WEIGHTS = RegulatorWeights()
@@ -62,20 +56,13 @@ class RegulatorProblem:
     """The sum of |E z + D u|^2 along z+ = A z + B u, where z is the state and what else of the observation counts.
 
     Under a disturbance d that stays, z and u count from (z_s, u_s) = rest d, where the tracked output is 0.
-
-    Attributes:
-        A: Shape (entries, entries).
-        B: Shape (entries, m).
-        E: Shape (costs, entries).
-        D: Shape (costs, m).
-        rest: Shape (entries + m, n).
     """
 
-    A: np.ndarray
-    B: np.ndarray
-    E: np.ndarray
-    D: np.ndarray
-    rest: np.ndarray
+    A: np.ndarray  # (entries, entries)
+    B: np.ndarray  # (entries, m)
+    E: np.ndarray  # (costs, entries)
+    D: np.ndarray  # (costs, m)
+    rest: np.ndarray  # (entries + m, n)
 
     def shifted(
         self, observations: np.ndarray, estimates: np.ndarray, disturbances: np.ndarray
@@ -86,11 +73,7 @@ class RegulatorProblem:
         return np.hstack([estimates, beyond.astype(np.float64)]) - z_s, z_s, u_s
 
     def gain(self) -> np.ndarray:
-        """Returns the gain of the optimal u = gain z, shape (m, entries).
-
-        Raises:
-            ValueError: If there is none.
-        """
+        """Returns the gain of the optimal u = gain z, shape (m, entries); raises ValueError if there is none."""
         if (gain := lqr_gain(self.A, self.B, self.E.T @ self.E, self.D.T @ self.D, self.E.T @ self.D)) is None:
             raise ValueError("there is no linear-quadratic regulator: the inputs cannot stabilize the plant")
         return gain
@@ -99,8 +82,8 @@ class RegulatorProblem:
 def regulator_problem(env: NCSEnv, weights: RegulatorWeights) -> RegulatorProblem:
     """Returns what a regulator of an environment's task minimizes.
 
-    Its cost weighs the error in the task's width, states in units of the box and inputs in units of their limits. The
-    speed error of `SpeedTracking`, e+ = e - dt u, is a state of its own. For `Regulation` it is what the reward counts.
+    The error is in units of the task's width, states of the box and inputs of their limits. The speed error of
+    `SpeedTracking`, e+ = e - dt u, is a state of its own. For `Regulation` it is what the reward counts.
     """
     plant, task = env.plant, env.task
     if isinstance(task, SetpointTracking):
@@ -163,7 +146,7 @@ def _tracking_problem(plant: LinearPlant, task: SetpointTracking, weights: Regul
 
 
 def regulator(env: NCSEnv, weights: RegulatorWeights) -> Inputs:
-    """Returns the linear-quadratic regulator of the task's error, with what is known of its targets."""
+    """Returns the linear-quadratic regulator of the task's error."""
     problem = regulator_problem(env, weights)
     gain = problem.gain()
 
@@ -239,19 +222,16 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
 
 
 def equilibrium(plant: LinearPlant, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns state (n,) and input (m,) with x = A x + B u and c x = 1, the smallest in units of box and limits.
+    """Returns state (n,) and input (m,) with x = A x + B u and c x = 1 for an output c, the smallest ones.
 
-    Where there is none, the least-squares solution. The output is c, shape (n,).
+    Where there are none, the least-squares solution; both in units of box and limits.
     """
     both = _rests(plant, output, plant.A, plant.B)[:, -1]
     return both[: plant.n], both[plant.n :]
 
 
 def _rests(plant: LinearPlant, output: np.ndarray, A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Returns R, shape (entries + m, n + 1): R (d, r) is a z above a u with z = A z + B u + (d, 0) and c z = r.
-
-    As `equilibrium`; A and B are those of a `RegulatorProblem`.
-    """
+    """Returns R, shape (entries + m, n + 1): R (d, r) is z above u with z = A z + B u + (d, 0) and c z = r."""
     n, others = plant.n, np.ones(len(A) - plant.n)
     half, scale = np.append(plant.half_widths, others), np.concatenate([plant.half_widths, others, plant.input_half])
     rest = np.hstack([np.eye(len(A)) - A, -B]) / half[:, None]
@@ -298,10 +278,7 @@ _PURSUED = Regulation, SpeedTracking, SetpointTracking
 
 
 def why_aimless(name: str, task: Task) -> str:
-    """Returns why a controller cannot pursue what a task asks for, an empty string if it can.
-
-    What another reward asks for nobody knows, nor what other observations are; a profile of targets may be your own.
-    """
+    """Returns why a controller cannot pursue what a task with its own reward asks for, an empty string if it can."""
     own = type(task).reward, type(task).observe
     if name not in REGULATORS or any(own == (each.reward, each.observe) for each in _PURSUED):
         return ""
@@ -314,14 +291,7 @@ def why_aimless(name: str, task: Task) -> str:
 def controller(
     name: str, env: NCSEnv, fallback: Fallback, seed: int, weights: RegulatorWeights = DEFAULT_WEIGHTS
 ) -> Policy:
-    """Returns a policy for vector environments of a kind.
-
-    Args:
-        name: A name in `CONTROLLERS` or `REGULATORS`.
-        env: A single environment with the plant and the task.
-        fallback: A certificate's: u = u_c + K (x_hat - x_c), K x_hat around the operating point.
-        seed: Seed of the random policy.
-        weights: Weights of the regulators.
+    """Returns a policy in `CONTROLLERS` or `REGULATORS` for vector environments like a single one.
 
     Raises:
         ValueError: If a regulator does not know what the task asks for.

@@ -31,18 +31,10 @@ Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 class CertaintyEquivalentFilter:
-    """Decides as the shield does, with Sigma_k = 0 in the place of the true error ellipsoid.
+    """Decides as the shield does, with Sigma_k = 0 in the place of the true error ellipsoid, and so without a proof.
 
-    This is what a safety filter does that is handed an estimate as if it were the state. Everything else is kept: the
-    safe set S, the disturbance bound E(D), the projection onto the inputs that pass, the margins against rounding, and
-    K x_hat where no input passes. With the error ellipsoid goes the proof: x = x_hat
-    is all it would hold for.
-
-    Args:
-        certificate: Verified exactly here.
-        plant: The plant it was made for.
-        margin: Fraction of the safe set that is kept free after the next step: the next state is taken to be off by as
-            much, margin^2 L in the place of A Sigma_k A', where states can be off at all: past inputs are known.
+    The margin is the fraction of the safe set that is kept free after the next step: margin^2 L in the place of
+    A Sigma_k A', where states can be off at all (past inputs are known).
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -74,18 +66,17 @@ class PredictiveFilter:
     The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied,
     the true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's
     error sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan
-    already, nothing is solved. Where the program has no solution, the rest of the last plan is applied, as the authors
-    do, and the fallback when it is used up.
+    already, nothing is solved. Where the program has no solution, the rest of the last plan is applied, then the
+    fallback.
 
-    After Wabersich and Zeilinger 2018 and Wabersich and Zeilinger 2021, both of which tighten; the tube of an estimate
-    is that of Mayne et al. 2006 (docs/bibliography.md).
+    After Wabersich and Zeilinger 2018 and Wabersich and Zeilinger 2021; the tube of an estimate is that of
+    Mayne et al. 2006 (docs/bibliography.md).
 
     Args:
         certificate: Gives S and K; verified exactly here.
-        plant: The plant it was made for.
+        plant: Its plant.
         horizon: N [steps], at least 2.
-        margin: Fraction of half the range of the box, and of the way from the resting point to a face of the safe set,
-            that is kept free.
+        margin: Fraction that is kept free of half the range of the box and of the way to a face of the safe set.
         tube: Whether the tightenings are those of the tube, beside the margin.
 
     Raises:
@@ -205,7 +196,6 @@ class PredictiveFilter:
 
 
 def _middle_and_half(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns middles and halves of ranges, of which one end may be open."""
     low, high = closed(low, high)
     return 0.5 * (low + high), 0.5 * (high - low)
 
@@ -213,10 +203,7 @@ def _middle_and_half(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.
 def _tube(
     certificate: Certificate, plant: LinearPlant, end_sizes: Callable[[np.ndarray], np.ndarray], horizon: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how far true states are off a plan in the rows of the box, (horizon + 1, k), and in the set at its end.
-
-    `end_sizes` returns how far the states of an ellipsoid of a given shape reach at the end.
-    """
+    """Returns how far true states are off a plan in the rows of the box, (horizon + 1, k), and at its end."""
     K, rows = certificate.K, plant.box
     first = list(certificate.error_shapes)
     pushes = [plant.B @ K @ shape @ (plant.B @ K).T for shape in first]
@@ -252,13 +239,8 @@ FILTERS: dict[str, Callable[..., Rule]] = {
 class EstimateFilter(VectorWrapper):
     """Applies what a filter makes of the proposed inputs, given the estimates; it proves nothing.
 
-    The infos gain `shield_intervened`, `input_proposed` and `shield_correction` as behind a `VectorSafetyShield`, but
-    no `shield_guaranteed`. A step that only resets an environment counts no intervention.
-
-    Args:
-        env: A vector environment with `estimate` in its infos.
-        rule: Decides the inputs.
-        penalty: Subtracted from the reward per intervention.
+    The infos gain `shield_intervened`, `input_proposed` and `shield_correction`, but no `shield_guaranteed`. A step
+    that only resets an environment counts no intervention. The penalty is subtracted from the reward per intervention.
 
     Raises:
         ValueError: If the innermost environment is not an `NCSVectorEnv`.
@@ -272,18 +254,14 @@ class EstimateFilter(VectorWrapper):
         self._begins_at_once = inner.autoreset_mode is AutoresetMode.SAME_STEP
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts episodes; see `NCSVectorEnv.reset`."""
+        """Starts episodes."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._estimates, self._begun = info["estimate"].copy(), info["episode_steps"] == 0
         nothing = np.zeros((self.num_envs, self._plant.m))
         return observation, info | _info(nothing, nothing, np.zeros(self.num_envs, np.bool_))
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Steps the environments with the filtered actions.
-
-        Raises:
-            ValueError: If an action is not finite or the shape is wrong.
-        """
+        """Steps the environments with the filtered actions."""
         proposed = self._inputs_of(actions).T.copy()
         applied = self._rule(self._estimates, proposed, self._begun)
         intervened = (applied != proposed).any(axis=1)
@@ -299,12 +277,9 @@ class EstimateFilter(VectorWrapper):
 
 @dataclass(frozen=True)
 class EstimateFilterSettings:
-    """Settings of a filter around a vector environment, which calling it puts there (`LoopConfig.filter`).
+    """Settings of a filter of `FILTERS` around a vector environment, which calling it puts there (`LoopConfig.filter`).
 
-    Attributes:
-        name: A name in `FILTERS`.
-        certificate: Certificate of the safe set; it is verified when the filter is built.
-        penalty: Subtracted from the reward per intervention.
+    The penalty is subtracted from the reward per intervention.
     """
 
     name: str

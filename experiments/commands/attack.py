@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -14,14 +13,13 @@ import gymnasium as gym
 import numpy as np
 
 from experiments.runs.loops import registered_env
-from experiments.runs.output_folder import require_place
-from experiments.settings import id_alone, require_horizon, require_limits, short_version
+from experiments.runs.output_folder import require_place, write_json
+from experiments.settings import id_alone, require_horizon, require_limits
 from experiments.terminal import progress_bar, say, text_table, wrapped
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, LinearPlant
 from ncs_gym.registration import EPISODE_STEPS, registered_ids
 from ncs_gym.validation import counted
 from shields import Certificate, VectorSafetyShield, certificate_for
-from shields.atomic_write import write_atomically
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,15 +31,13 @@ class AttackSettings:
     full size, and agents are random or hostile. Ends with exit code 1 if a guaranteed state is outside.
 
     Attributes:
-        env: Id of the only environment to attack; module:id first imports the module, which registers one of your own.
-            By default all registered ones.
+        env: Id of the only environment to attack, or module:id; by default all registered ones.
         steps: Simulated steps in all, at least 8 episodes of each environment and channel.
         mode: Mode of the shield; "monitor" only watches. In mode lookahead states may leave the safe set.
         safe_set: What the shields keep; by default the polytope, where there is one.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         out: File for the counts (JSON).
         seed: Seed of the attack, >= 0.
-        smoke: Attack one environment a little, to see that everything works.
     """
 
     env: str | None = None
@@ -51,7 +47,6 @@ class AttackSettings:
     horizon: int | None = None
     out: Path | None = None
     seed: int = 0
-    smoke: bool = False
 
     def __post_init__(self) -> None:
         require_limits(self, steps=1, seed=0)
@@ -74,14 +69,13 @@ _LEGEND = (
 
 def attack(settings: AttackSettings) -> None:
     """Runs `ncs attack`; ends with exit code 1 if a guaranteed state was outside, or a guarantee was lost."""
-    settings = short_version(settings, steps=1, env=settings.env or registered_ids()[0])
     require_place(settings.out)
     envs = {each: registered_env(each) for each in ([settings.env] if settings.env else registered_ids())}
     channels = {env_id: channels_of(env.channel, env.contract) for env_id, env in envs.items()}
     cases = [(env_id, kind, channel) for env_id in envs for kind, channel in channels[env_id].items()]
     each = max(-(-settings.steps // (len(cases) * EPISODE_STEPS)), _FEWEST)
     rows, failed = {}, Counter[str]()
-    with progress_bar(len(cases) * each * EPISODE_STEPS, "attack", "step") as bar:
+    with progress_bar(len(cases) * each * EPISODE_STEPS, "attack") as bar:
         for number, (env_id, kind, channel) in enumerate(cases):
             env = envs[env_id]
             certificate = certificate_for(env.plant, env.certificate_contract, settings.safe_set)
@@ -98,8 +92,7 @@ def attack(settings: AttackSettings) -> None:
             rows[f"{id_alone(env_id).removeprefix('ncs_gym/')}, {kind}"] = counts
             failed.update(counts)
     print(table_of(rows))
-    if settings.out is not None:
-        write_atomically(settings.out, json.dumps(rows, indent=1) + "\n")
+    write_json(settings.out, rows)
     wrong = {"outside the box": failed["guaranteed outside box"]}
     if settings.mode != "lookahead":
         wrong["outside S"] = failed["guaranteed outside S"]
@@ -111,7 +104,7 @@ def attack(settings: AttackSettings) -> None:
 
 
 def channels_of(own: Channel, contract: ChannelContract | None) -> dict[str, Channel]:
-    """Returns a channel, and those that use a contract up by delays and by losses; without one a blackout."""
+    """Returns a channel, and those that use its contract up by delays and by losses; without one a blackout."""
     if contract is None:
         return {"own": own, "blackout": Channel(loss=1.0)}
     age, step = contract.max_age, contract.quantization_step
@@ -120,10 +113,7 @@ def channels_of(own: Channel, contract: ChannelContract | None) -> dict[str, Cha
 
 
 def worst_case(certificate: Certificate, mode: str = "project") -> dict[str, Any]:
-    """Returns the noise and disturbance of an environment that push the next state farthest out of the safe set.
-
-    In mode "lookahead", which may leave that set, they push it out of the box.
-    """
+    """Returns settings of environments that push states out of the safe set, in mode "lookahead" out of the box."""
     push = {"M": certificate.M} if certificate.polytope is None else {"rows": certificate.polytope.rows}
     return {"noise": "extreme", "disturbance": AdversarialDisturbance(**({} if mode == "lookahead" else push))}
 
@@ -137,10 +127,7 @@ def starts(certificate: Certificate, rng: np.random.Generator, count: int, reach
 def hostile_agents(
     certificate: Certificate, plant: LinearPlant, count: int, rng: np.random.Generator
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns the actions (N, m) of agents that see estimates (N, n).
-
-    They are, a quarter each, random, outwards, the certified gain turned round, and bang-bang.
-    """
+    """Returns what makes actions (N, m) of estimates (N, n): random, outwards, the gain turned round, bang-bang."""
     outwards = (plant.B.T @ certificate.M @ plant.A).T
     turned = -1e3 * (certificate.K / plant.input_half[:, None]).T
     signs, kinds = rng.choice([-1.0, 1.0], (count, plant.m)), 4 * np.arange(count)[:, None] // count
@@ -154,10 +141,9 @@ def hostile_agents(
 
 
 def attacked(shield: VectorSafetyShield, rng: np.random.Generator) -> Iterator[Counter[str]]:
-    """Plays an episode in each environment behind a shield, from the boundary of the safe set.
+    """Plays an episode in each environment from the boundary of the safe set, and yields the counts of each step.
 
-    Yields what is counted at the start and in each step; "lost" is a guarantee that ended although the channels kept
-    their contracts.
+    "lost" is a guarantee that ended although the channels kept their contracts.
     """
     certificate, plant, count = shield.certificate, shield.filter.plant, shield.num_envs
     reach = _INWARD if shield.env.unwrapped.single.downlink is None else _BEHIND_DOWNLINK

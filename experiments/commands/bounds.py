@@ -68,7 +68,7 @@ def bounds(settings: BoundsSettings) -> None:
 
 
 def _read(path: Path, inputs: list[str], outputs: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the inputs, shape (N, m), and the outputs, (N, p) or (N + 1, p), of a table with these columns."""
+    """Returns inputs, shape (N, m), and outputs, (N, p) or (N + 1, p), of a table with these columns."""
     wanted = [*inputs, *outputs]
     forms = f"a record has the columns {', '.join(wanted)} of numbers, and a row for each step"
 
@@ -87,10 +87,9 @@ def _read(path: Path, inputs: list[str], outputs: list[str]) -> tuple[np.ndarray
             raise ValueError(f"it has no rows; {forms}")
     except OSError as error:
         raise ValueError(f"cannot read the record in {shown(path)}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{shown(path)}: it is no text in UTF-8; {forms}") from error
     except ValueError as error:
-        raise ValueError(f"{shown(path)}: {error}") from None
+        why = f"it is no text in UTF-8; {forms}" if isinstance(error, UnicodeDecodeError) else error
+        raise ValueError(f"{shown(path)}: {why}") from None
     table, m = np.reshape(rows, (-1, len(wanted))), len(inputs)
     ends_open = bool(np.isnan(table[-1, :m]).all())
     acted, measured = table[: len(table) - ends_open, :m], table[:, m:]

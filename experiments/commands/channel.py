@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,13 @@ import tyro
 
 from experiments.analysis.stalls import broken_contracts, how_often, rate_text
 from experiments.runs.loops import registered_env
-from experiments.runs.output_folder import require_place
+from experiments.runs.output_folder import require_place, write_json
 from experiments.terminal import text_table, wrapped
 from ncs_gym import LinearPlant, PacketLog
 from ncs_gym.network.channel import in_time
 from ncs_gym.network.contract import MAX_AGE
 from ncs_gym.validation import counted
 from shields import Certificate, silence_of
-from shields.atomic_write import write_atomically
 from shields.packaged_certificates import certificate_of_package
 
 
@@ -86,14 +84,9 @@ def channel(settings: ChannelSettings) -> None:
         row = _row(found, contract.max_age)
         share = f", in {100.0 * row['broken']:.3g} % of steps" if row["times"] else ""
         newest = f"a newest sample of at most {counted(contract.max_age, 'step')}"
+        ahead = " (behind a downlink it also counts the steps by which inputs are committed ahead)"
+        newest += ahead * (settings.certificate is not None)
         print(wrapped(f"The {whose}'s contract, {newest}, was broken {how_often(row)}{share}."))
-        if settings.certificate:
-            print(
-                wrapped(
-                    "Behind a downlink the certificate's own also counts the steps by which inputs are committed "
-                    "ahead: see the row with so many less."
-                )
-            )
     elif certificate is not None:
         print(f"The {whose} needs no contract: it holds through any silence.")
     if len(asked) > 1:
@@ -105,8 +98,7 @@ def channel(settings: ChannelSettings) -> None:
                 "meanwhile, the box is left no more often."
             )
         )
-    if settings.out is not None:
-        write_atomically(settings.out, json.dumps(found, indent=1) + "\n")
+    write_json(settings.out, found)
 
 
 def _numbers(log: PacketLog, dt: float, asked: list[int]) -> dict[str, Any]:

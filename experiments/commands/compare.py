@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import pandas as pd
 import tyro
 
-from agents.agent_file import has_pretrained
+from agents.agent_file import pretrained_folders
 from experiments.analysis.episodes import (
     arm_summaries,
     episodes_table,
@@ -19,21 +17,21 @@ from experiments.analysis.episodes import (
     training_table,
 )
 from experiments.backends.execution import results_of
-from experiments.baselines import why_aimless
+from experiments.baselines.controllers import why_aimless
 from experiments.plots.comparison_figures import comparison_figures
 from experiments.report.html import comparison_report
-from experiments.report.text_tables import certificate_line, decimals_of, summary_text
+from experiments.report.text_tables import decimals_of, summary_text
 from experiments.runs.arms import Arm, by_arm, full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config, registered_env
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.provenance import experiment_provenance
-from experiments.runs.training_run import RunResult
 from experiments.settings import LearningSettings, id_alone, short_version
 from experiments.terminal import say, wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
 from shields import verify
+from shields.certificate_text import size_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,23 +52,14 @@ class CompareSettings(LearningSettings):
             lqr+shielded.
         baselines: Arms that are listed below the others and not drawn.
         scenarios: Other evaluations: worst-case-disturbance, worse-channel, ideal-channel, attacked,
-            attacked-on-an-ideal-channel, gaussian (in the
-            documentation under "Experiments").
-        tuned_arms: Whether arms are trained with what was tuned for each by itself (`benchmarks.learning`); no option
-            of the command line.
+            attacked-on-an-ideal-channel, gaussian (in the documentation under "Experiments").
+        tuned_arms: Whether arms are trained with what was tuned for each by itself (`benchmarks.learning`).
     """
 
     out: Path = Path("runs/compare")
     seeds: int = 3
     arms: tuple[str, ...] = ("unshielded", "penalized", "trusting", "shielded")
-    baselines: tuple[str, ...] = (
-        "zero input",
-        "K x_hat",
-        "untrained",
-        "lqr",
-        "lqr+trusting",
-        "lqr+shielded",
-    )
+    baselines: tuple[str, ...] = ("zero input", "K x_hat", "untrained", "lqr", "lqr+trusting", "lqr+shielded")
     scenarios: tuple[str, ...] = ("as trained",)
     tuned_arms: tyro.conf.Suppress[bool] = False
 
@@ -82,22 +71,8 @@ _SMOKE_ARMS, _SMOKE_PAIR = ("unshielded", "shielded"), (PRETRAINED, f"{PRETRAINE
 _SMOKE_BASELINES = ("zero input",)
 
 
-class Comparison(NamedTuple):
-    """What a comparison found.
-
-    Attributes:
-        episodes: A row per evaluation episode (`episodes_table`).
-        summary: What summary.json holds.
-        results: Results of the runs, with the agents that were trained.
-    """
-
-    episodes: pd.DataFrame
-    summary: dict[str, Any]
-    results: Sequence[RunResult]
-
-
-def compare(settings: CompareSettings) -> Comparison:
-    """Runs `ncs compare`: prints the table, writes the files, and returns what they are made of."""
+def compare(settings: CompareSettings) -> None:
+    """Runs `ncs compare`."""
     settings = _with_full_names(shortened(settings))
     loop = loop_config(settings.env, settings.channel, between_samples=settings.between_samples)
     names = settings.arms + settings.baselines
@@ -105,7 +80,9 @@ def compare(settings: CompareSettings) -> Comparison:
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     claim_folder("compare", settings.completed)
     verification = verify(certificate, ncs_env(loop.single()).plant)
-    print(wrapped(certificate_line(certificate, verification)), flush=True)
+    size = size_of(certificate)
+    held = f"certificate: {len(verification.conditions)} conditions hold in exact arithmetic"
+    print(wrapped(f"{held} ({size})" if size else held), flush=True)
     if is_any_trained(settings, names):
         print(*(wrapped(each.agent_line) for each in settings.by_algorithm), sep="\n", flush=True)
     settings = settings.completed
@@ -144,13 +121,12 @@ def compare(settings: CompareSettings) -> Comparison:
     print(f"\n{wrapped(f'{settings.env}: {runs_per_arm} and {per_run}')}\n")
     print(summary_text(summary["arms"], summary["references"]))
     print(*map(wrapped, findings), f"files: {settings.out}", sep="\n")
-    return Comparison(episodes, summary, results)
 
 
 def shortened(settings: CompareSettings) -> CompareSettings:
-    """Returns the settings of the short version if `--smoke` is given, otherwise the same settings."""
+    """Returns the settings of the short version if `--smoke` is given; see `short_version`."""
     chosen, default = {}, type(settings)
-    pair = _SMOKE_PAIR if has_pretrained(id_alone(settings.env)) else ()
+    pair = _SMOKE_PAIR if id_alone(settings.env) in pretrained_folders() else ()
     if settings.arms == default.arms:
         chosen["arms"] = _SMOKE_ARMS + pair
     if settings.baselines == default.baselines and pair:
@@ -159,10 +135,7 @@ def shortened(settings: CompareSettings) -> CompareSettings:
 
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:
-    """Returns the settings with the full names of arms, each of which is listed once.
-
-    Of the usual baselines those that do not know what the task asks for are left out.
-    """
+    """Returns the settings with full names of arms, each once, without usual baselines that cannot do the task."""
     arms, baselines = (full_names(names, settings) for names in (settings.arms, settings.baselines))
     if settings.baselines == type(settings).baselines:
         task = registered_env(settings.env).task

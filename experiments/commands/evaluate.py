@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -14,15 +13,14 @@ from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary
 from experiments.report.text_tables import summary_text
 from experiments.runs.loops import certificate_of, registered_env, with_channel
-from experiments.runs.output_folder import require_place
+from experiments.runs.output_folder import require_place, write_json
 from experiments.runs.policies import agent_named, certificate_file
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import RunResult
-from experiments.settings import Assignments, id_alone, require_horizon, require_limits, short_version
+from experiments.settings import Assignments, id_alone, require_horizon, require_limits
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
-from shields.atomic_write import write_atomically
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,17 +30,15 @@ class EvaluateSettings:
     Attributes:
         model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
             `ncs train`; or "pretrained", for the agent of --env that comes with the package.
-        env: Id of the environment the agent was trained in; module:id, to import the module that registers it.
+        env: Id of the environment the agent was trained in, or module:id.
         shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
             nothing and counts what it would have done.
         horizon: Longest plan of mode "lookahead" [steps]; by default that of the agent's training, otherwise 6.
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
         certificate: Certificate file to use instead of that of the training, or of synthesizing one.
-        between_samples: Times per step at which the safe box counts, 1 for the sampling instants; by default the
-            plant's own.
+        between_samples: Times per step at which the safe box counts; by default the plant's own.
         channel: Changes of the channel that the agent was trained with, by the names that `ncs compare` lists.
-        smoke: Evaluate a few episodes only, to see that everything works.
         out: File for the summary (JSON).
     """
 
@@ -55,7 +51,6 @@ class EvaluateSettings:
     certificate: Path | None = None
     between_samples: int | None = None
     channel: Assignments = field(default_factory=dict)
-    smoke: bool = False
     out: Path | None = None
 
     def __post_init__(self) -> None:
@@ -64,19 +59,12 @@ class EvaluateSettings:
             require_horizon(self, self.shield)
 
 
-# Budget of `--smoke`.
-_SMOKE = {"episodes": 5}
-
-
 def evaluate(settings: EvaluateSettings) -> None:
     """Runs `ncs evaluate`."""
-    settings = short_version(settings, **_SMOKE)
     require_place(settings.out)
-    env_id = None
     if settings.env is not None:
         registered_env(settings.env)
-        env_id = id_alone(settings.env)
-    agent, folder = agent_named(str(settings.model), env_id)
+    agent, folder = agent_named(str(settings.model), settings.env and id_alone(settings.env))
     loop = LoopConfig(env=agent.env, kwargs=agent.env_kwargs)
     if settings.between_samples is not None:
         loop = loop.with_kwargs(between_samples=settings.between_samples)
@@ -108,18 +96,17 @@ def evaluate(settings: EvaluateSettings) -> None:
         (arm,) = arms.values()
         held = f"{arm['eval_proved_steps']:,} of {counted(arm['eval_steps'], 'step')}"
         print(wrapped(f"The guarantee held after {held}."))
-    if settings.out is not None:
-        content = {
-            "arms": arms,
-            "env": agent.env,
-            "channel": loop.channel and asdict(loop.channel),
-            "kwargs": others,
-            "horizon": shield and shield.horizon,
-            "episodes": settings.episodes,
-            "seed": settings.seed,
-            "model": {"folder": str(folder), "sha256": agent.checksum},
-            "plant": ncs_env(loop.single()).plant.fingerprint,
-            "certificate": certificate.checksum,
-            "versions": versions(),
-        }
-        write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+    content = {
+        "arms": arms,
+        "env": agent.env,
+        "channel": loop.channel and asdict(loop.channel),
+        "kwargs": others,
+        "horizon": shield and shield.horizon,
+        "episodes": settings.episodes,
+        "seed": settings.seed,
+        "model": {"folder": str(folder), "sha256": agent.checksum},
+        "plant": ncs_env(loop.single()).plant.fingerprint,
+        "certificate": certificate.checksum,
+        "versions": versions(),
+    }
+    write_json(settings.out, content)

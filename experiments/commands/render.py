@@ -17,7 +17,7 @@ from tqdm import tqdm
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place
 from experiments.runs.policies import policy_by_name
-from experiments.settings import id_alone, require_horizon, require_limits, short_version
+from experiments.settings import id_alone, require_horizon, require_limits
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.rendering import theme
 from ncs_gym.validation import counted
@@ -30,18 +30,16 @@ class RenderSettings:
     """Draws an episode of a policy, as an animation or its last frame.
 
     Attributes:
-        env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
-            your own (`ncs_gym.register_plant`).
+        env: Id of an environment with a plant of its own, or module:id.
         out: File to write: .gif, or .png for the last frame alone.
-        policy: "lqr", "mpc", "zero", "random", "pretrained" (the small agent of the package), or the folder of a
-            trained agent.
+        policy: lqr, mpc, zero-input, random, pretrained (the small agent of the package), or the folder of a trained
+            agent.
         shield: Mode of the shield; "none" for no shield.
         horizon: Longest plan of mode "lookahead" [steps]; 6 by default.
         side_by_side: Draw the same episode without a shield at the left, with it at the right.
         certificate: Certificate file to use instead of synthesizing one.
         seed: Seed of the episode (of both, side by side) and of the random policy.
         steps: Largest number of steps.
-        smoke: Draw a few steps only, to see that everything works; into episode-smoke.gif unless `--out` differs.
     """
 
     env: str = "ncs_gym/TruckTrailerCruise-v0"
@@ -53,7 +51,6 @@ class RenderSettings:
     certificate: Path | None = None
     seed: int = 0
     steps: int = 200
-    smoke: bool = False
 
     def __post_init__(self) -> None:
         require_horizon(self, self.shield)
@@ -62,15 +59,14 @@ class RenderSettings:
             raise ValueError('--side-by-side compares with a shield: choose a --shield other than "none"')
 
 
-# Budget of `--smoke`, and the white between frames side by side, with a line [pixels].
-_SMOKE, _GAP, _GRAY = {"steps": 5}, 8, 120
+# The white between frames side by side, with a line [pixels].
+_GAP, _GRAY = 8, 120
 # Time of a frame of an animation, and of its last one [ms].
 _FRAME_TIME, _LAST_FRAME_TIME = 100, 2000
 
 
 def render(settings: RenderSettings) -> None:
     """Runs `ncs render`."""
-    settings = short_version(settings, **_SMOKE)
     registered_env(settings.env)
     if settings.out.suffix not in (".gif", ".png"):
         raise ValueError(f"--out must end in .gif or .png, got {settings.out}")
@@ -112,11 +108,11 @@ class _Episode:
         self.is_over, self._steps = False, 0
 
     def frame(self) -> np.ndarray:
-        """Returns the frame of the present step, shape (height, width, 3), uint8."""
+        """Returns a frame, shape (height, width, 3), uint8."""
         return np.asarray(self._env.render())
 
     def step(self) -> None:
-        """Simulates a step, unless the episode is over."""
+        """Simulates a step unless the episode is over."""
         if not self.is_over:
             action = self._policy(self._observation, self._info)
             self._observation, _, terminated, truncated, self._info = self._env.step(action)

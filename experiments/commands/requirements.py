@@ -2,51 +2,40 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import shields
-from experiments.runs.loops import registered_env
-from experiments.runs.output_folder import require_place
-from experiments.settings import require_one_plant
+from experiments.runs.loops import plant_in_use
+from experiments.runs.output_folder import require_place, write_json
+from experiments.settings import PlantSettings
 from experiments.terminal import text_table, wrapped
 from ncs_gym import LinearPlant
 from ncs_gym.network.channel import in_time
 from ncs_gym.validation import counted
-from shields.atomic_write import write_atomically
 from shields.packaged_certificates import synthesis_status
 from shields.synthesis.network_requirements import AGES, share_of
 
 
 @dataclass(frozen=True, kw_only=True)
-class RequirementsSettings:
+class RequirementsSettings(PlantSettings):
     """Finds how old and how coarse the samples of a plant may be, so that it is certifiable.
 
     Prints what share of the safe box a certificate keeps, - where none was found (which does not prove that there is
-    none).
+    none). By default the plant is that of ncs_gym/CartPole-v0.
 
     Attributes:
-        env: Id of an environment with a plant of its own, or module:id, which first imports the module. By default
-            ncs_gym/CartPole-v0.
-        plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
         ages: Largest ages of the newest sample when an input takes effect [steps]; by default up to 32, and the
             environment's.
         resolutions: Quantization steps, in the units of the measurements, 0 for none; by default the environment's.
         out: File for the table with its certificates (JSON).
     """
 
-    env: str | None = None
-    plant: Path | None = None
     ages: tuple[int, ...] = ()
     resolutions: tuple[float, ...] = ()
     out: Path | None = None
 
-    def __post_init__(self) -> None:
-        require_one_plant(self)
 
-
-_DEFAULT_ENV = "ncs_gym/CartPole-v0"
 _TITLES = {
     "ellipsoid": "ellipsoid's share of the box [%]",
     "polytope": "polytope's share of the box [%]",
@@ -56,11 +45,7 @@ _TITLES = {
 
 def requirements(settings: RequirementsSettings) -> None:
     """Runs `ncs requirements`."""
-    if settings.plant is None:
-        env = registered_env(settings.env or _DEFAULT_ENV)
-        plant, today, delay = env.plant, env.certificate_contract, env.downlink_protocol.input_delay
-    else:
-        plant, today, delay = LinearPlant.load(settings.plant), None, 0
+    plant, today, delay = plant_in_use(settings.env or "ncs_gym/CartPole-v0", settings.plant)[1:4]
     ages = settings.ages or tuple({*AGES, *(() if today is None else (today.max_age,))})
     resolutions = settings.resolutions or (0.0 if today is None else today.quantization_step,)
     require_place(settings.out)
@@ -85,7 +70,7 @@ def requirements(settings: RequirementsSettings) -> None:
     if settings.out is not None:
         documents = {checksum: certificate.document for checksum, certificate in certified.items()}
         content = found.document | {"plant": plant.fingerprint, "documents": documents}
-        write_atomically(settings.out, json.dumps(content, indent=1) + "\n")
+        write_json(settings.out, content)
         print(f"saved to {settings.out}")
 
 

@@ -25,15 +25,12 @@ from ncs_gym.validation import counted
 class SweepSettings(LearningSettings):
     """Compares arms over a grid of channels: how safety, return and interventions depend on the channel.
 
-    Every point of the grid is a comparison of its own with the same seeds. Leaves episodes.parquet, summary.json,
-    settings.json and the models. Started again with the same folder, finished runs are kept. What all channels have in
-    common is given as --channel.
+    Seeds are the same at every point. Leaves episodes.parquet, summary.json, settings.json and the models. Started
+    again with the same folder, finished runs are kept. What all channels have in common is given as --channel.
 
     Attributes:
-        out: Output folder; created if it does not exist.
+        out: Output folder.
         seeds: Number of paired training runs per arm and channel.
-        steps: Training steps per run, rounded up to whole rollouts.
-        episodes: Evaluation episodes per run.
         arms: Arms of the comparison; see `ncs compare`.
         losses: Loss probabilities of the grid.
         delays: Delays of the grid [steps].

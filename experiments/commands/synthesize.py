@@ -7,21 +7,20 @@ from pathlib import Path
 from typing import Literal
 
 import shields
-from experiments.runs.loops import registered_env
+from experiments.runs.loops import plant_in_use
 from experiments.runs.output_folder import require_place
-from experiments.settings import require_one_plant
-from ncs_gym import ChannelContract, LinearPlant
+from experiments.settings import PlantSettings
+from ncs_gym import ChannelContract
 from shields.packaged_certificates import synthesis_status
 
 
 @dataclass(frozen=True, kw_only=True)
-class SynthesizeSettings:
+class SynthesizeSettings(PlantSettings):
     """Synthesizes a certificate for an environment's plant, verifies it exactly and saves it.
 
+    By default the plant is that of ncs_gym/TruckTrailerCruise-v0.
+
     Attributes:
-        env: Id of an environment with a plant of its own; module:id first imports the module, which registers one of
-            your own (`ncs_gym.register_plant`). By default ncs_gym/TruckTrailerCruise-v0.
-        plant: File of a plant that `LinearPlant.save` wrote, in place of an environment's.
         safe_set: What a shield with this certificate keeps: the ellipsoid, or the largest polytope that the same gain
             keeps in the safe box, which leaves the policy more room. By default the polytope.
         between_samples: Times per step at which the safe box counts, for a claim at all times; by default the plant's
@@ -35,8 +34,6 @@ class SynthesizeSettings:
             for the plant of a file.
     """
 
-    env: str | None = None
-    plant: Path | None = None
     safe_set: Literal["polytope", "ellipsoid"] | None = None
     between_samples: int | None = None
     time_limit: float | None = 60.0
@@ -44,21 +41,21 @@ class SynthesizeSettings:
     max_age: int | None = None
     quantization_step: float | None = None
 
-    def __post_init__(self) -> None:
-        require_one_plant(self)
-
 
 def synthesize(settings: SynthesizeSettings) -> None:
     """Runs `ncs synthesize`."""
     require_place(settings.out)
-    if settings.plant is None:
-        env = registered_env(settings.env or "ncs_gym/TruckTrailerCruise-v0")
-        plant, own, input_delay = env.plant, env.certificate_contract, env.downlink_protocol.input_delay
-    else:
-        plant, own, input_delay = LinearPlant.load(settings.plant), None, 0
+    found = plant_in_use(settings.env or "ncs_gym/TruckTrailerCruise-v0", settings.plant)
+    plant, own = found.plant, found.contract
     if settings.between_samples is not None:
         plant = replace(plant, limits=replace(plant.limits, between_samples=settings.between_samples))
-    contract = changed_contract(own, settings.max_age, settings.quantization_step)
+    max_age, step = settings.max_age, settings.quantization_step
+    if own is not None:
+        max_age = own.max_age if max_age is None else max_age
+        step = own.quantization_step if step is None else step
+    if max_age is None and step is not None:
+        raise ValueError("--quantization-step belongs to a contract of the channel: give --max-age, too")
+    contract = None if max_age is None else ChannelContract(max_age, step or 0.0)
     with synthesis_status() as show:
         certificate = shields.synthesize(
             plant,
@@ -70,23 +67,7 @@ def synthesize(settings: SynthesizeSettings) -> None:
     certificate.save(settings.out)
     print(certificate, shields.verify(certificate, plant), sep="\n")
     # Under another contract than the environment's no downlink is known.
-    silence = shields.silence_of(certificate, plant, input_delay if contract == own else 0)
+    silence = shields.silence_of(certificate, plant, found.input_delay if contract == own else 0)
     if silence is not None:
         print(f"Beyond the contract:\n{silence}")
     print(f"saved to {settings.out}")
-
-
-def changed_contract(
-    contract: ChannelContract | None, max_age: int | None, quantization_step: float | None
-) -> ChannelContract | None:
-    """Returns a channel contract with what is given, None for what stays.
-
-    Raises:
-        ValueError: If a value is out of range, or there is a quantization step and no age.
-    """
-    if contract is not None:
-        max_age = contract.max_age if max_age is None else max_age
-        quantization_step = contract.quantization_step if quantization_step is None else quantization_step
-    if max_age is None and quantization_step is not None:
-        raise ValueError("--quantization-step belongs to a contract of the channel: give --max-age, too")
-    return None if max_age is None else ChannelContract(max_age, quantization_step or 0.0)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from shutil import rmtree
 
 from experiments.analysis.episodes import arm_summary
 from experiments.backends.execution import results_of
@@ -13,7 +12,6 @@ from experiments.runs.arms import Arm, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import experiment_provenance
-from experiments.runs.training_run import CHECKPOINT, history_of
 from experiments.settings import LearningSettings, short_version
 from experiments.terminal import wrapped
 from ncs_gym.validation import counted
@@ -22,8 +20,6 @@ from ncs_gym.validation import counted
 @dataclass(frozen=True, kw_only=True)
 class TrainSettings(LearningSettings):
     """Trains one agent, evaluates it, and saves it with everything needed to use it.
-
-    Started again with the same folder, an interrupted training goes on from its last checkpoint; --force begins anew.
 
     Attributes:
         out: Output folder.
@@ -51,19 +47,10 @@ def train(settings: TrainSettings) -> None:
     print(wrapped(settings.agent_line), flush=True)
     settings = settings.completed
     run = run_of_arm(settings, loop, certificate, settings.arm, 0)
-    checkpoint = settings.out / "tensorboard" / run.name / CHECKPOINT
-    if settings.force:
-        rmtree(checkpoint, ignore_errors=True)
-    history = history_of(checkpoint) if settings.engine == "local" else []  # what other machines leave stays there
-    if history and history[-1].steps < run.steps:
-        run = replace(run, went_on_after=history[-1].steps)
-        print(f"the training in {settings.out} goes on after {counted(run.went_on_after, 'step')}", flush=True)
     (result,) = results_of([run], settings.out, settings)
-    rmtree(checkpoint, ignore_errors=True)
     arms = {settings.arm: arm_summary([result], arm.mode, fixed_policy=True)}
     certificate.save(settings.out / "certificate.json")
-    summary = {"arms": arms, "went_on_after": result.went_on_after}
-    write_results(settings.out, summary | experiment_provenance(settings, loop, certificate, [run]))
+    write_results(settings.out, {"arms": arms} | experiment_provenance(settings, loop, certificate, [run]))
     print(f"{counted(result.train_steps, 'training step')}, {counted(settings.episodes, 'episode')}\n")
     print(summary_text(arms, {}))
     if result.train_steps and not result.train_violation_steps and not result.train_interventions:

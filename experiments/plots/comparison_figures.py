@@ -38,10 +38,7 @@ RATE_WINDOW = 64 * 200
 
 
 def comparison_figures(summary: dict[str, Any], results: ResultsByArm) -> dict[str, tuple[str, bytes]]:
-    """Returns caption and PNG file of every figure by name, what the findings are about first.
-
-    There is none of the training where nothing happened in it: no episode was finished, nothing violated or overridden.
-    """
+    """Returns caption and PNG file of every figure by name; none of a training in which nothing happened."""
     arms, styles = {name: results[name] for name in summary["arms"]}, arm_styles(summary["arms"])
     trained = {name: runs for name, runs in arms.items() if runs[0].history}
     points = [point for runs in trained.values() for result in runs for point in result.history]
@@ -89,7 +86,6 @@ def scatter_figure(summary: dict[str, dict[str, Any]], styles: Mapping[str, ArmS
 
 
 def _draw_evaluated(axis: Axes, style: ArmStyle, arm: dict[str, Any]) -> None:
-    """Draws an arm's runs, its mean and the intervals of both."""
     if arm["runs"] > 1:
         rates = [100.0 * rate for rate in arm["eval_violation_rate_by_run"]]
         dots = {"ms": 4.5, "mfc": style.color, "mec": "white", "mew": 0.6, "zorder": 2.5}
@@ -112,10 +108,7 @@ _TRAINING_CAPTION = (
 
 
 def training_figure(arms: ResultsByArm, styles: Mapping[str, ArmStyle]) -> CaptionedFigure:
-    """Returns return, violating steps so far and intervention rate against training steps, bands over runs.
-
-    Without an arm that watches for unsafe actions there is no third panel.
-    """
+    """Returns return, violating steps so far and, if an arm watches, intervention rate against training steps."""
     watching = [name for name in arms if Arm.of(name).mode is not None]
     few = False
     with matplotlib.rc_context(STYLE):
@@ -152,10 +145,7 @@ def training_figure(arms: ResultsByArm, styles: Mapping[str, ArmStyle]) -> Capti
 
 
 def _histories(results: Sequence[RunResult]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns steps (points,), and returns, violating steps and interventions so far (runs, points) of an arm.
-
-    The runs of an arm note their totals at the same steps; of one that noted fewer only those are left.
-    """
+    """Returns steps (points,), and returns, violating steps and interventions so far (runs, points) of an arm."""
     points = min(len(result.history) for result in results)
     names = ("steps", "episode_return", "violation_steps", "interventions")
     steps, *others = (

@@ -31,19 +31,10 @@ STYLE: dict[Any, Any] = {
 }
 # Mean width of a letter and of a handle in a legend [inches].
 _LETTER, _HANDLE = 0.085, 0.6
-_SQUARED = "\N{SUPERSCRIPT TWO}"
 
 
 class CaptionedFigure(Figure):
-    """A figure of matplotlib with a caption.
-
-    Args:
-        size: Width and height [inches].
-        caption: Text below the figure.
-
-    Attributes:
-        caption: Text below the figure.
-    """
+    """A figure of matplotlib of a size [inches], with a `caption`."""
 
     def __init__(self, size: tuple[float, float], caption: str = "") -> None:
         super().__init__(figsize=size, layout="constrained")
@@ -59,11 +50,6 @@ class CaptionedFigure(Figure):
         return buffer.getvalue()
 
 
-def with_unit(name: str, unit: str) -> str:
-    """Returns an axis label; some plants have no units."""
-    return f"{name} [{unit}]".replace("^2", _SQUARED) if unit else name
-
-
 def label(axis: Axes, x: str, y: str, title: str = "") -> None:
     """Sets labels and title of an axis."""
     axis.set_xlabel(x)
@@ -71,10 +57,14 @@ def label(axis: Axes, x: str, y: str, title: str = "") -> None:
     axis.set_title(title)
 
 
-def legend_below(figure: Figure, handles: dict[str, Artist], rows: int = 1) -> None:
-    """Puts one legend below a figure, where it covers no data, in at least `rows` rows and as many as it needs."""
-    names, columns = list(handles), max(1, -(-len(handles) // rows))
-    while columns > 1 and _width(names, columns) > figure.get_figwidth():
+def legend_below(figure: Figure, handles: dict[str, Artist]) -> None:
+    """Puts one legend below a figure, where it covers no data, in as many rows as it needs."""
+    names, columns = list(handles), len(handles)
+
+    def width() -> float:  # about how wide it is [inches]: one column after the other is filled
+        return sum(_LETTER * max(map(len, part)) + _HANDLE for part in np.array_split(np.array(names), columns))
+
+    while columns > 1 and width() > figure.get_figwidth():
         columns -= 1
     figure.legend(list(handles.values()), names, loc="outside lower center", ncols=columns)
 
@@ -82,11 +72,6 @@ def legend_below(figure: Figure, handles: dict[str, Artist], rows: int = 1) -> N
 def thousands(value: float, _: object = None) -> str:
     """Returns a tick's text with thousands separators and a true minus sign."""
     return f"{value:,.12g}".replace("-", "\N{MINUS SIGN}")
-
-
-def _width(names: list[str], columns: int) -> float:
-    """Returns about how wide a legend is [inches]; matplotlib fills one column after the other."""
-    return sum(_LETTER * max(map(len, part)) + _HANDLE for part in np.array_split(np.array(names), columns))
 
 
 # Colors (after Okabe and Ito, which color-blind readers can distinguish) and markers (for print without color).
@@ -109,14 +94,7 @@ _DASHES: tuple[Any, ...] = ("-", (0, (4.5, 1.6)), (0, (1.0, 1.3)))
 
 @dataclass(frozen=True)
 class ArmStyle:
-    """Style of an arm.
-
-    Attributes:
-        color: Hexadecimal color.
-        marker: Marker of matplotlib.
-        dashes: Line style of matplotlib.
-        size: Size of the markers [points].
-    """
+    """Style of an arm, in matplotlib's words; the size of markers is in points."""
 
     color: str
     marker: str

@@ -20,12 +20,10 @@ _PIXEL_RATIO = 2.1
 _PNG_WIDTH = slice(16, 20)
 
 
-# Caption and PNG file of each figure, by its name.
-Figures = Mapping[str, tuple[str, bytes]]
-
-
-def comparison_report(summary: dict[str, Any], verification: Report, figures: Figures, findings: list[str]) -> str:
-    """Returns the page of `ncs compare`: tables, findings, figures, certificate and settings; opens offline."""
+def comparison_report(
+    summary: dict[str, Any], verification: Report, figures: Mapping[str, tuple[str, bytes]], findings: list[str]
+) -> str:
+    """Returns the page of `ncs compare`, which opens offline."""
     settings, arms = summary["settings"], summary["arms"] | summary["references"]
     images = {name: _image(caption, png) for name, (caption, png) in figures.items()}
     return _template().render(
@@ -39,16 +37,16 @@ def comparison_report(summary: dict[str, Any], verification: Report, figures: Fi
         findings=findings,
         summary=summary,
         settings=settings,
-        shown_settings={name: _text(value) for name, value in flat(settings).items()},
+        shown_settings={name: _text(value) for name, value in _flat(settings).items()},
         verification=verification,
     )
 
 
-def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Returns JSON values by their dotted names, without the objects that hold others."""
     found: dict[str, Any] = {}
     for name, value in values.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return found
 
 

@@ -9,8 +9,6 @@ from typing import Any
 from experiments.runs.loops import AS_TRAINED
 from experiments.terminal import text_table, wrapped
 from ncs_gym.validation import counted
-from shields import Certificate, Report
-from shields.certificate_text import size_of
 
 _MOST_DECIMALS = 4
 # Arms and points whose proof did not hold that are listed.
@@ -22,9 +20,7 @@ def summary_text(arms: _Arms, baselines: _Arms) -> str:
     """Returns the tables of training and evaluation for a terminal; baselines stand below a rule.
 
     Violating episodes have their exact interval, the return has Student's (`experiments.analysis.episodes`). "Outside
-    S" counts episodes in which the true state was outside the safe set at some step, be it the first one, "from a plan"
-    the steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store. The training
-    of those that were trained has a table of its own, scenarios are parts of that of the evaluation.
+    S" counts episodes. Scenarios are parts of the table of the evaluation.
     """
     everything = arms | baselines
     trained = {name: arm for name, arm in everything.items() if arm["train_steps"]}
@@ -39,7 +35,7 @@ def summary_text(arms: _Arms, baselines: _Arms) -> str:
 
 
 def _text(corner: str, parts: dict[str, _Arms], columns: list[_Column], above: int = 0) -> str:
-    """Returns a table with a part per scenario, in which a rule follows so many arms."""
+    """Returns a table with a part per scenario, in which a rule follows `above` arms."""
     first, second = zip(*(header for header, _ in columns), strict=True)
     rows, rules = [[corner, *first], ["", *second]], []
     for title, arms in parts.items():
@@ -125,10 +121,3 @@ def sweep_table(cells: list[dict[str, Any]]) -> str:
     more = f" and {counted(len(lost) - _MOST_LOST, 'other')}" if len(lost) > _MOST_LOST else ""
     text = f"The proof held in some evaluation episodes only: {'; '.join(lost[:_MOST_LOST])}{more}."
     return f"{table}\n\n{wrapped(text)}"
-
-
-def certificate_line(certificate: Certificate, verification: Report) -> str:
-    """Returns one line about a certificate and its exact verification."""
-    size = size_of(certificate)
-    conditions = f"certificate: {len(verification.conditions)} conditions hold in exact arithmetic"
-    return f"{conditions} ({size})" if size else conditions

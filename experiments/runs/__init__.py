@@ -1,1 +1,1 @@
-"""The unit of work: a training run, the control loop it takes place in, and the store of finished results."""
+"""The unit of work: a training run, the control loop it takes place in, and its output folder."""

@@ -9,15 +9,9 @@ from functools import cache
 from agents.agent_file import AGENT_FILES, pretrained_folder
 from agents.hyperparams import ALGORITHMS, with_changes
 from agents.loop import LoopConfig, ShieldSettings
-from experiments.baselines import (
-    CONTROLLERS,
-    FILTERS,
-    MARGINS,
-    REGULATORS,
-    EstimateFilterSettings,
-    tuned_training,
-    why_aimless,
-)
+from experiments.baselines.controllers import CONTROLLERS, REGULATORS, why_aimless
+from experiments.baselines.filters import FILTERS, EstimateFilterSettings
+from experiments.baselines.tuned import tuned_training
 from experiments.runs.loops import other_scenarios, registered_env, under
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.training_run import RunResult, TrainingRun, require_trainable
@@ -30,9 +24,8 @@ _SHIELD_MODES = tuple(mode for mode in MODES if mode != "monitor")
 _POLICIES = (*CONTROLLERS, *REGULATORS, "untrained", PRETRAINED)
 _KNOWN_ARMS = (
     "unshielded, monitor, penalized[:WEIGHT], lagrangian[:LIMIT], FILTER, FILTER+penalty, 'FILTER at test', POLICY and "
-    f"POLICY+FILTER, with FILTER one of shielded[:MODE], lookahead, trusting[:MARGIN], psf[:MARGIN], psf:tube and "
-    f"POLICY one of untrained, {PRETRAINED}, {', '.join(CONTROLLERS)}, lqr[:observer], mpc[:observer], "
-    f"mpc[:MARGIN] (modes: {', '.join(_SHIELD_MODES)}; margins in percent: {', '.join(map(str, MARGINS))})"
+    f"POLICY+FILTER, with FILTER one of shielded[:MODE], lookahead, {', '.join(FILTERS)} and POLICY one of "
+    f"{', '.join(_POLICIES)} (modes: {', '.join(_SHIELD_MODES)})"
 )
 
 # Results of the training runs of each arm, in the order of their indices.
@@ -44,7 +37,7 @@ class Arm:
     """How the agents of an arm are trained and evaluated.
 
     Attributes:
-        name: Name of the arm.
+        name: Its full name.
         mode: Mode of the shield, or name of another filter in `FILTERS`; None for neither.
         policy: What acts: "trained" for a trained agent.
         penalizes_interventions: Whether the training reward is reduced per intervention.
@@ -69,11 +62,7 @@ class Arm:
 
     @classmethod
     def of(cls, name: str, mode: str = "project") -> Arm:
-        """Returns the arm of a name, whose spaces may be given as hyphens.
-
-        Raises:
-            ValueError: If the name is unknown.
-        """
+        """Returns the arm of a name, whose spaces may be given as hyphens; raises ValueError if it is unknown."""
         return _parsed(name, mode)
 
     @property
@@ -89,13 +78,7 @@ class Arm:
     def loops(
         self, loop: LoopConfig, certificate: Certificate, settings: LearningSettings
     ) -> tuple[LoopConfig, LoopConfig]:
-        """Returns the control loop that the arm's policies are trained in, and the one that they are evaluated in.
-
-        Args:
-            loop: The bare control loop.
-            certificate: Certificate of the shield or filter.
-            settings: Horizon and penalties.
-        """
+        """Returns the control loops that the arm's policies are trained and evaluated in, given the bare one."""
 
         def filtered(penalty: float = 0.0) -> LoopConfig:
             if self.mode is None:
@@ -183,8 +166,7 @@ def require_arms(settings: LearningSettings, loop: LoopConfig, names: Sequence[s
     """Raises what arms cannot do in an environment, as far as that is known without a certificate.
 
     Raises:
-        ValueError: If an arm or a scenario is unknown, an arm cannot pursue the task, a scenario cannot be simulated,
-            or agents cannot be trained with the hyperparameters given.
+        ValueError: If an arm or a scenario is unknown or impossible, or the hyperparameters train nothing.
     """
     for each in settings.by_algorithm:
         require_trainable(each, loop)
@@ -214,7 +196,7 @@ def run_of_arm(
     index: int,
     grid_point: str = "",
 ) -> TrainingRun:
-    """Returns one training run of an arm, or the run of an arm in which nothing is trained.
+    """Returns one run of an arm.
 
     Raises:
         ValueError: If the arm or a scenario is unknown.

@@ -8,13 +8,13 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 
 from agents.loop import LoopConfig
 from experiments.settings import id_alone
-from ncs_gym import Channel, ChannelContract, GilbertElliott, NCSEnv
+from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.contract import contract_of
 from ncs_gym.registration import needing_extras, registered_ids
@@ -27,13 +27,9 @@ _SHARE = 1e-3
 
 
 def registered_env(env_id: str) -> NCSEnv:
-    """Returns a registered environment that has a plant of its own.
+    """Returns a registered environment; raises ValueError if there is none of that id with a plant of its own.
 
-    Args:
-        env_id: Id, or "module:id" as Gymnasium takes it, which imports the module: only for ids that the user gave.
-
-    Raises:
-        ValueError: If the id is not registered or has no plant of its own, or there is no such module.
+    The id may be "module:id", which imports the module: only for ids that the user gave.
     """
     module, _, name = env_id.rpartition(":")
     if module:
@@ -55,11 +51,7 @@ def registered_env(env_id: str) -> NCSEnv:
 
 
 def import_module(module: str) -> None:
-    """Imports a module of the user's, which registers environments; it may lie in the working directory.
-
-    Raises:
-        ValueError: If there is no such module.
-    """
+    """Imports a module of the user's, also of the working directory; raises ValueError if there is none."""
     if not all(part.isidentifier() for part in module.split(".")):
         raise ValueError(f"--env module:id needs the name of a module, got {module!r}")
     folder = os.getcwd()
@@ -73,33 +65,42 @@ def import_module(module: str) -> None:
         raise ValueError(f"there is no module {module!r}, neither installed nor in {folder}") from error
 
 
+class PlantInUse(NamedTuple):
+    """A plant, and what is known of the environment that it is in, if it is in one."""
+
+    origin: str  # id of the environment, or the plant's file
+    plant: LinearPlant
+    contract: ChannelContract | None = None  # of the environment's certificates
+    input_delay: int = 0  # steps by which inputs are committed ahead
+    asks: bool = False  # whether samples are taken on request
+
+
+def plant_in_use(env_id: str, file: Path | None) -> PlantInUse:
+    """Returns the plant of a file, otherwise that of an environment; for errors see `registered_env`."""
+    if file is not None:
+        return PlantInUse(str(file), LinearPlant.load(file))
+    env = registered_env(env_id)
+    delay = env.downlink_protocol.input_delay
+    return PlantInUse(env_id, env.plant, env.certificate_contract, delay, env.channel.on_request)
+
+
 def loop_config(env_id: str, channel: Mapping[str, Any] | None = None, **kwargs: Any) -> LoopConfig:
-    """Returns the bare control loop of a registered environment.
+    """Returns the bare control loop of a registered environment with changes of its channel and its keyword arguments.
 
-    Args:
-        env_id: Id, or "module:id" if the user gave it.
-        channel: Changes of the environment's own channel by name; see `changed_channel`.
-        **kwargs: Keyword arguments of the environment; None keeps its own.
-
-    Raises:
-        ValueError: If the environment is unknown or has no plant of its own, or cannot have the channel.
+    None keeps the environment's own. For errors see `registered_env` and `changed_channel`.
     """
     registered_env(env_id)
     return with_channel(LoopConfig(env=id_alone(env_id), kwargs=kwargs), channel or {})
 
 
 def with_channel(loop: LoopConfig, changes: Mapping[str, Any]) -> LoopConfig:
-    """Returns a control loop with changes of its channel; for arguments and errors see `changed_channel`."""
+    """Returns a control loop with changes of its channel; see `changed_channel`."""
     changed = changed_channel(ncs_env(loop.single()).channel, changes)
-    return loop if changed is None else loop.with_kwargs(channel=asdict(changed))
+    return loop if changed is None else _on(loop, changed)
 
 
 def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
-    """Returns an environment's own channel with changes; None for no changes.
-
-    Args:
-        own: The environment's own channel.
-        changes: Fields of `Channel` by name; None keeps a value.
+    """Returns an environment's own channel with changes of its fields, of which None changes nothing; else None.
 
     Raises:
         ValueError: If a name is unknown or a value out of range.
@@ -109,20 +110,15 @@ def changed_channel(own: Channel, changes: Mapping[str, Any]) -> Channel | None:
     for name in given.keys() - set(known):
         raise ValueError(f"--channel {name}: a channel has no such setting; known are {', '.join(known)}")
     changed = replace(own, **given)
-    if "loss" in given and "max_consecutive_losses" not in given and (text := fewer_losses(changed)):
-        warn_caller(text, UserWarning)
+    most, wanted = changed.max_consecutive_losses, replace(changed, max_consecutive_losses=None).mean_loss
+    is_asked = "loss" in given and "max_consecutive_losses" not in given
+    if is_asked and most is not None and changed.mean_loss < wanted - _SHARE:
+        warn_caller(
+            f"{changed.mean_loss:.3g} of the packets are lost in the long run, not {wanted:.3g}: the channel loses at "
+            f"most {most} in a row",
+            UserWarning,
+        )
     return None if changed == own else changed
-
-
-def fewer_losses(channel: Channel) -> str:
-    """Returns that a channel loses fewer packets than its losses say, since it loses so many in a row; else nothing."""
-    most, wanted = channel.max_consecutive_losses, replace(channel, max_consecutive_losses=None).mean_loss
-    if most is None or channel.mean_loss >= wanted - _SHARE:
-        return ""
-    return (
-        f"{channel.mean_loss:.3g} of the packets are lost in the long run, not {wanted:.3g}: the channel loses at most "
-        f"{most} in a row"
-    )
 
 
 # The scenario that agents are trained under.
@@ -130,11 +126,7 @@ AS_TRAINED = "as trained"
 
 
 def scenario_named(name: str) -> str:
-    """Returns a scenario's name as it is printed; hyphens stand for spaces.
-
-    Raises:
-        ValueError: If it is unknown.
-    """
+    """Returns a scenario's name as it is printed, with spaces for hyphens; raises ValueError if it is unknown."""
     for known in (AS_TRAINED, *_CHANGES):
         if known.replace("-", " ") == name.replace("-", " "):
             return known
@@ -142,32 +134,20 @@ def scenario_named(name: str) -> str:
 
 
 def other_scenarios(names: Sequence[str]) -> tuple[str, ...]:
-    """Returns the different scenarios that are named, without that of the training.
-
-    Raises:
-        ValueError: If one is unknown.
-    """
+    """Returns the different scenarios that are named, without that of the training; see `scenario_named`."""
     return tuple(dict.fromkeys(name for each in names if (name := scenario_named(each)) != AS_TRAINED))
 
 
 def under(scenario: str, loop: LoopConfig) -> LoopConfig:
-    """Returns a control loop under a scenario; everything else stays the same.
-
-    Raises:
-        ValueError: If the scenario is unknown, or the channel cannot be worse within the contract.
-    """
+    """Returns a control loop under a scenario; raises ValueError if it is unknown or impossible there."""
     return loop if scenario == AS_TRAINED else _CHANGES[scenario_named(scenario)](loop)
 
 
 def worse_channel(channel: Channel, contract: ChannelContract | None) -> Channel:
-    """Returns a channel on which half of the packets that arrived are lost too, and the others are later.
+    """Returns a channel that loses half of the packets that arrived, and delays the others more.
 
-    All are as late as the latest were, and, as far as a contract allows it, later by one transmission period. Without
-    a contract every delay is allowed; with one, losses are where the channel loses packets at all.
-
-    Args:
-        channel: The channel that agents were trained with.
-        contract: What the certificate assumes of the channel; None for nothing.
+    All are as late as the latest were, and, as far as the certificate's contract allows it, later by one transmission
+    period. Without a contract every delay is allowed; with one, a channel without losses stays without.
 
     Raises:
         ValueError: If there is no worse channel within the contract.
@@ -189,49 +169,41 @@ def worse_channel(channel: Channel, contract: ChannelContract | None) -> Channel
 
 
 def _more_loss(loss: float | GilbertElliott) -> float | GilbertElliott:
-    """Returns losses that let half as many packets through, in each state of a bursty channel."""
     if isinstance(loss, GilbertElliott):
         return replace(loss, loss_good=_more_loss(loss.loss_good), loss_bad=_more_loss(loss.loss_bad))
     return 0.5 * (1.0 + loss)
 
 
-def _on_worse_channel(loop: LoopConfig) -> LoopConfig:
+def _on(loop: LoopConfig, channel: Channel) -> LoopConfig:
+    return loop.with_kwargs(channel=asdict(channel))
+
+
+def _worsened(loop: LoopConfig) -> LoopConfig:
     env = ncs_env(loop.single())
-    return loop.with_kwargs(channel=asdict(worse_channel(env.channel, env.contract)))
-
-
-def bursts_at_their_longest(channel: Channel) -> Channel:
-    """Returns a channel that loses as many packets in a row as it may, each time; one without losses as it is."""
-    return channel if channel.most_consecutive_losses == 0 else replace(channel, loss=1.0)
-
-
-def _on_ideal_channel(loop: LoopConfig) -> LoopConfig:
-    return loop.with_kwargs(channel=asdict(Channel()))
+    return _on(loop, worse_channel(env.channel, env.contract))
 
 
 def _attacked(loop: LoopConfig) -> LoopConfig:
     """Returns a loop with the disturbance that does the most harm, noise of full size, and bursts at their longest."""
-    worst = bursts_at_their_longest(ncs_env(loop.single()).channel)
-    return loop.with_kwargs(disturbance="adversarial", noise="extreme", channel=asdict(worst))
+    own = ncs_env(loop.single()).channel
+    worst = own if own.most_consecutive_losses == 0 else replace(own, loss=1.0)
+    return _on(loop.with_kwargs(disturbance="adversarial", noise="extreme"), worst)
 
 
 _CHANGES: dict[str, Callable[[LoopConfig], LoopConfig]] = {
     "worst-case disturbance": lambda loop: loop.with_kwargs(disturbance="adversarial"),
-    "worse channel": _on_worse_channel,
+    "worse channel": _worsened,
     "gaussian": lambda loop: loop.with_kwargs(noise="gaussian"),
-    "ideal channel": _on_ideal_channel,
+    "ideal channel": lambda loop: _on(loop, Channel()),
     "attacked": _attacked,
-    "attacked on an ideal channel": lambda loop: _on_ideal_channel(_attacked(loop)),
+    "attacked on an ideal channel": lambda loop: _on(_attacked(loop), Channel()),
 }
 
 
 def certificate_of(loop: LoopConfig, file: Path | None = None, safe_set: str | None = None) -> Certificate:
     """Returns a certificate for the plant of a control loop, under the contract of its channels.
 
-    Args:
-        loop: The control loop.
-        file: File of the certificate, which is verified; None synthesizes one.
-        safe_set: Of one that is synthesized: "polytope", "ellipsoid" or None; see `shields.synthesize`.
+    It is read from a file and verified, or for None made with a `safe_set` (see `shields.certificate_for`).
 
     Raises:
         ValueError: If the environment cannot have its keyword arguments.

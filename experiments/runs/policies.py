@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from agents.agent_file import AgentError, pretrained_folder
-from experiments.baselines import REGULATORS, controller, tuned_weights
+from experiments.baselines.controllers import REGULATORS, controller
+from experiments.baselines.tuned import tuned_weights
 from experiments.terminal import say
 from ncs_gym import NCSEnv
 from shields.certificate import Fallback
@@ -17,9 +18,8 @@ from shields.certificate import Fallback
 if TYPE_CHECKING:
     from agents.agent import Agent
 
-# Controllers that need neither training nor a certificate, and the short name of one.
-UNTRAINED_POLICIES = ("zero", "random", *REGULATORS)
-_SHORT = {"zero": "zero input"}
+# Controllers that need neither training nor a certificate.
+_UNTRAINED = ("zero input", "random", *REGULATORS)
 # Stands for the agent of the environment that comes with the package.
 PRETRAINED = "pretrained"
 # Agents that a message names.
@@ -30,29 +30,22 @@ Policy = Callable[[np.ndarray, dict], np.ndarray]
 
 
 def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
-    """Returns a policy for an environment.
-
-    Args:
-        name: One of `UNTRAINED_POLICIES`, "pretrained" for the agent that comes with the package, or the folder of a
-            trained agent or of the run that left it.
-        env_id: Id of the environment.
-        env: The environment.
-        seed: Seed of the random policy.
+    """Returns an untrained controller, whose spaces may be given as hyphens, or what an agent of `agent_named` does.
 
     Raises:
         AgentError: If there is no agent for this environment.
         ValueError: If the folder of a run holds several agents.
     """
-    if name in UNTRAINED_POLICIES:
+    if (untrained := name.replace("-", " ")) in _UNTRAINED:
         nothing = Fallback.of_gain(np.zeros((env.plant.m, env.plant.n)))
-        act = controller(_SHORT.get(name, name), env, nothing, seed, tuned_weights(env_id, name))
+        act = controller(untrained, env, nothing, seed, tuned_weights(env_id, untrained))
 
         def action(observation: np.ndarray, info: dict) -> np.ndarray:
             return act(observation[None], {key: np.asarray(value)[None] for key, value in info.items()})[0].astype("f4")
 
         return action
     if name != PRETRAINED and not Path(name).exists():
-        names = ", ".join(each for each in (*UNTRAINED_POLICIES, PRETRAINED) if ":" not in each)
+        names = ", ".join(each for each in (*_UNTRAINED, PRETRAINED) if ":" not in each)
         raise ValueError(f"no policy {name}: there is no such file or folder, and those with a name are {names}")
     agent, _ = agent_named(name, env_id)
     if name != PRETRAINED and agent.env_kwargs:
@@ -61,11 +54,7 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
 
 
 def agent_named(name: str, env_id: str | None) -> tuple[Agent, Path]:
-    """Returns a trained agent, and the folder that it is in.
-
-    Args:
-        name: As for `policy_by_name`.
-        env_id: Id of the environment that it has to be of; None for any.
+    """Returns the "pretrained" agent or one of a folder, and the folder that it is in; its environment may be any.
 
     Raises:
         AgentError: If there is no agent, or it is of another environment.

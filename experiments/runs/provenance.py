@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-import platform
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from cloudpickle import dumps
 
+from agents.agent_file import installed_versions
 from agents.loop import LoopConfig
 from experiments.settings import LearningSettings, id_alone, lasting_settings
 from ncs_gym.envs.env import ncs_env
@@ -29,22 +27,12 @@ _DEPENDENCIES += ("numpy", "scipy", "filterpy")
 _SOURCE_PACKAGES = ("ncs_gym", "shields", "agents", "experiments")
 
 
+@cache
 def versions() -> dict[str, str]:
     """Returns the versions of the installed packages that results depend on, and a digest of this project's source."""
-    return {"python": platform.python_version()} | _installed() | {"source": _source_digest()}
+    return installed_versions(_DEPENDENCIES) | {"source": _source_digest()}
 
 
-@cache
-def _installed() -> dict[str, str]:
-    """Returns the versions of packages; looked up once, because the key of every training run needs them."""
-    found = {}
-    for name in _DEPENDENCIES:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
-
-
-@cache
 def _source_digest() -> str:
     """Returns a SHA-256 over the source of the four packages; the registered environments are code, too."""
     root = Path(__file__).resolve().parents[2]
@@ -56,15 +44,15 @@ def _source_digest() -> str:
 
 
 def module_digest(module: str) -> str:
-    """Returns the SHA-256 of an imported module's source, empty for no module: what it registers may change."""
+    """Returns the SHA-256 of an imported module's source, empty for no module."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return hashlib.sha256(Path(file).read_bytes()).hexdigest() if file else ""
 
 
 def registration_of(env_id: str) -> str:
-    """Returns the SHA-256 of what an id is registered with, empty for none: a module may register it otherwise later.
+    """Returns the SHA-256 of what an id is registered with, empty for none.
 
-    Functions and classes of a module count by their names: its source is another matter (`module_digest`).
+    Functions and classes of a module count by their names (`module_digest` knows its source).
     """
     spec = gym.registry.get(id_alone(env_id))
     if spec is None:
@@ -78,7 +66,7 @@ def registration_of(env_id: str) -> str:
 def experiment_provenance(
     settings: LearningSettings, loop: LoopConfig, certificate: Certificate, runs: Sequence[TrainingRun]
 ) -> dict[str, Any]:
-    """Returns what a reader needs to know where the results of a command come from, JSON values."""
+    """Returns where the results of a command come from, JSON values."""
     env = ncs_env(loop.single())
     channel = env.channel.description
     if env.downlink is not None:

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agents.agent_file import AGENT_FILES
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
-from agents.results import HISTORY_FILE, Episode, TrainingPoint
-from experiments.baselines import controller, tuned_weights
+from agents.results import Episode, TrainingPoint
+from experiments.baselines.controllers import controller
+from experiments.baselines.tuned import tuned_weights
 from experiments.runs.loops import AS_TRAINED, import_module, under
 from experiments.runs.provenance import module_digest, registration_of, versions
 from experiments.settings import LearningSettings
@@ -30,25 +28,15 @@ from shields.json_documents import digest
 if TYPE_CHECKING:
     from agents.agent import Agent
 
-# Folder of a run's checkpoints below that of its events.
-CHECKPOINT = "checkpoint"
-
 
 @dataclass(frozen=True)
 class RunResult:
-    """Result of a training run.
+    """Result of a training run, with the contents of the trained agent's files by name.
 
     Attributes:
-        arm: Name of the run's arm.
-        index: Number of the run within its arm.
-        train_steps: Number of training steps; 0 if nothing was trained.
-        train_violation_steps: Number of training steps whose true state violated the safe box.
-        train_interventions: Number of training steps in which the shield intervened.
         history: Running totals during the training.
         episodes: Evaluation episodes.
-        files: Contents of the trained agent's files by name; empty if nothing was trained.
-        scenarios: Evaluation episodes under other scenarios than that of the training, by the scenario's name.
-        went_on_after: Steps of an interrupted training that this one went on from; 0 for none.
+        scenarios: Evaluation episodes under other scenarios by name.
     """
 
     arm: str
@@ -60,11 +48,10 @@ class RunResult:
     episodes: list[Episode]
     files: dict[str, bytes] = field(default_factory=dict)
     scenarios: dict[str, list[Episode]] = field(default_factory=dict)
-    went_on_after: int = 0
 
     @classmethod
     def of_json(cls, values: dict[str, Any]) -> RunResult:
-        """Returns the result of what `dataclasses.asdict` made of it, arrays as lists, without files."""
+        """Returns the result of what `dataclasses.asdict` made of it, without files."""
         episodes = [Episode(**each) for each in values["episodes"]]
         history = [TrainingPoint(**each) for each in values["history"]]
         scenarios = {name: [Episode(**each) for each in played] for name, played in values["scenarios"].items()}
@@ -85,25 +72,18 @@ class TrainingRun:
     """Settings of one training run.
 
     Attributes:
-        arm: Name of the arm that the run belongs to.
         policy_kind: "trained" is a trained agent; "untrained" an agent with its initial weights; "pretrained" the one
-            that comes with the package, in `agent_files`; the others are
-            controllers (`experiments.baselines.CONTROLLERS` and `REGULATORS`).
+            that comes with the package, in `agent_files`; the others are controllers (`experiments.baselines`).
         training_loop: Control loop that the policy is trained in, with its penalties.
         loop: Control loop that the policy is evaluated in.
-        module: Module of the user's that registers the environment, imported where the run is executed; empty for none.
-        seed: Seed of the experiment.
+        module: Module of the user's that registers the environment, imported where the run is executed.
         index: Number of the run within its arm; runs with equal index are paired across arms.
-        steps: Training steps.
-        episodes: Evaluation episodes.
-        certificate: Certificate of shield or filter, which also defines x'Mx and the gain of controllers.
-        scenarios: Scenarios that the policy is evaluated under besides that of its training.
-        algorithm: Name of the learning algorithm, one of `agents.hyperparams.ALGORITHMS`.
-        settings: Hyperparameters of the learning algorithm.
+        certificate: Certificate of shield or filter, which also defines `times_safe_set` and the gain of controllers.
+        scenarios: Further scenarios that the policy is evaluated under.
+        algorithm: A name in `agents.hyperparams.ALGORITHMS`.
+        settings: Its hyperparameters.
         grid_point: Name of the point of a sweep's grid; part of the run's name only.
-        agent_files: Files of an agent that was trained before: it is evaluated, and nothing is trained. Empty for none.
-        went_on_after: Steps of an interrupted training that this one goes on from, its checkpoint in the folder of its
-            events; 0 for one that begins. The result is kept under the same key.
+        agent_files: Files of an agent that was trained before: it is evaluated, and nothing is trained.
     """
 
     arm: str
@@ -121,38 +101,21 @@ class TrainingRun:
     settings: dict[str, Any]
     grid_point: str = ""
     agent_files: dict[str, bytes] = field(default_factory=dict)
-    went_on_after: int = 0
-
-    result_type = RunResult
-    unit = "step"
-
-    @property
-    def parts(self) -> tuple[str, ...]:
-        """What the steps belong to."""
-        return ("training", "evaluation") if self.trains else ("evaluation",)
-
-    @property
-    def leaves(self) -> tuple[str, ...]:
-        """Names of the files of the agent that is trained."""
-        return AGENT_FILES if self.trains else ()
 
     @property
     def trains(self) -> bool:
-        """Whether an agent is trained in this run."""
+        """Whether an agent is trained."""
         return self.policy_kind == "trained" and not self.agent_files
 
     @property
     def name(self) -> str:
-        """Name of the run in file names and progress lines."""
+        """Name in file names and progress lines."""
         return "-".join(filter(None, (self.grid_point, self.arm, str(self.index)))).replace(" ", "-").replace(":", "-")
 
     @property
     def training_seed(self) -> int:
-        """Seed of the training environments and of the networks; the same in all arms.
-
-        A training that goes on meets other random numbers than it had before.
-        """
-        return self._seeds(*([self.went_on_after] if self.went_on_after else []))[0]
+        """Seed of the training environments and of the networks; the same in all arms."""
+        return self._seeds()[0]
 
     @property
     def evaluation_seed(self) -> int:
@@ -162,10 +125,8 @@ class TrainingRun:
     @property
     def key(self) -> str:
         """SHA-256 of all that the result depends on: settings, environment, source, versions of packages."""
-        others = {"certificate", "grid_point", "module", "went_on_after"}
-        names = set(self.__dataclass_fields__) - others
         certificate = self.certificate.checksum
-        content = {name: getattr(self, name) for name in names}
+        content = {name: value for name, value in vars(self).items() if name not in ("certificate", "grid_point")}
         content |= {
             "module": module_digest(self.module),
             "environment": registration_of(self.loop.env),
@@ -183,12 +144,7 @@ class TrainingRun:
         if not self.trains:
             return evaluation
         rollout = rollout_steps(self.algorithm, self.settings)
-        return -(-self.remaining_steps // rollout) * rollout + evaluation
-
-    @property
-    def remaining_steps(self) -> int:
-        """Training steps that are left, one at least."""
-        return max(self.steps - self.went_on_after, 1)
+        return -(-self.steps // rollout) * rollout + evaluation
 
     def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
         """Returns the result; only TensorBoard's events are written."""
@@ -196,25 +152,21 @@ class TrainingRun:
             import_module(self.module)
         trained = None
         if self.trains:
-            from agents.agent import Agent  # imports torch, which the process that only collects results does without
-            from agents.training import train
+            from agents.training import (
+                train,  # imports torch, which the process that only collects results does without
+            )
 
-            logs, start, history = log_folder and log_folder / self.name, None, []
-            if logs is not None and self.went_on_after:
-                start, history = Agent.load(logs / CHECKPOINT), history_of(logs / CHECKPOINT)
-            elif logs is not None:
+            logs = log_folder and log_folder / self.name
+            if logs is not None:
                 shutil.rmtree(logs, ignore_errors=True)
             trained = train(
                 self.training_loop,
-                self.remaining_steps,
+                self.steps,
                 self.training_seed,
                 self.algorithm,
                 self.settings,
                 log_folder=logs,
-                checkpoints=logs and logs / CHECKPOINT,
                 on_progress=on_progress,
-                start=start,
-                history=history,
             )
         agent = trained.agent if trained else _agent_of(self)
         safe_set, played = self.certificate.polytope or self.certificate.M, {}
@@ -232,16 +184,15 @@ class TrainingRun:
             episodes=played.pop(AS_TRAINED),
             files=trained.agent.files() if trained else {},
             scenarios=played,
-            went_on_after=self.went_on_after,
         )
 
-    def _seeds(self, *more: int) -> list[int]:
+    def _seeds(self) -> list[int]:
         """Returns two 31-bit numbers that depend on the experiment's seed and the run's index, not on the arm."""
-        return [int(word >> 1) for word in np.random.SeedSequence([self.seed, self.index, *more]).generate_state(2)]
+        return [int(word >> 1) for word in np.random.SeedSequence([self.seed, self.index]).generate_state(2)]
 
 
 def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
-    """Returns a control loop as JSON values, what belongs to the certificate under the name given to that."""
+    """Returns a control loop as JSON values, with the checksum of its certificate."""
     values = dict(vars(loop))
     for name in ("shield", "filter"):
         values[name] = values[name] and vars(values[name]) | {"certificate": certificate}
@@ -251,7 +202,7 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
 
 
 def _agent_of(run: TrainingRun) -> Agent | None:
-    """Returns the agent that a run does not train: that of its files, or one with initial weights; None for none."""
+    """Returns the agent that a run does not train: that of its files, one with initial weights, or None."""
     if run.agent_files:
         from agents.agent import Agent  # imports torch
 
@@ -263,23 +214,8 @@ def _agent_of(run: TrainingRun) -> Agent | None:
     return untrained(run.loop, run.training_seed, run.algorithm, run.settings)
 
 
-def history_of(checkpoint: Path) -> list[TrainingPoint]:
-    """Returns what happened in the training that left a checkpoint; nothing where there is none.
-
-    Raises:
-        ValueError: If the checkpoint is damaged.
-    """
-    path = checkpoint / HISTORY_FILE
-    try:
-        points: Any = json.loads(path.read_bytes()) if path.exists() else []
-        unknown: Any = nan  # null in the file
-        return [TrainingPoint(**{key: unknown if v is None else v for key, v in each.items()}) for each in points]
-    except (AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"no training can go on from {checkpoint}: it is damaged; --force begins anew") from error
-
-
 def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
-    """Returns what acts in the evaluation of a run: an agent, or for None the run's controller, which begins anew."""
+    """Returns what acts in the evaluation of a run: an agent, or without one a controller that begins anew."""
     if agent is not None:
         return lambda observations, infos: agent.act(observations)
     env, fallback, weights = ncs_env(run.loop.single()), run.certificate.fallback, tuned_weights(run.loop.env, run.arm)
@@ -287,7 +223,7 @@ def _policy(run: TrainingRun, agent: Agent | None) -> Policy:
 
 
 def require_trainable(settings: LearningSettings, loop: LoopConfig) -> None:
-    """Raises what training would raise later if agents cannot be trained with the hyperparameters given."""
+    """Raises ValueError if agents cannot be trained with the hyperparameters given."""
     if settings.hyperparams or loop.lagrangian is not None:
         from agents import training  # imports torch
 

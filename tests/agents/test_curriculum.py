@@ -10,7 +10,6 @@ from agents import SB3VecEnv
 from agents.loop import CostPenalty
 from ncs_gym import (
     Channel,
-    RandomChannel,
     RequestActions,
     VectorNetworked,
     VectorRandomChannel,
@@ -49,28 +48,6 @@ def test_channel_of_an_option_lasts_one_episode_under_stable_baselines3_alone_an
         assert episodes(SB3VecEnv(vector, info_keywords=("channel_loss",))) == theirs
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_what_is_drawn_from_changes_for_episodes_that_begin_by_themselves_and_infos_of_their_starts_say_so(mode):
-    envs = gym.make_vec(ID, num_envs=2, max_episode_steps=4, autoreset_mode=mode)
-    draws = VectorRandomChannel(envs, [Channel(loss=0.1)])
-    env = SB3VecEnv(draws, info_keywords=("channel_loss",))
-    env.seed(0)
-    env.reset()
-    draws.draw_from(lambda rng: {"loss": 0.5})
-    seen = []
-    for _ in range(13):
-        observation, _, _, infos = env.step(np.zeros((2, 1), np.float32))
-        seen.append(infos[1]["channel_loss"])
-        if "episode" in infos[1]:
-            assert env.reset_infos[1]["channel_loss"] == 0.5
-            np.testing.assert_allclose(observation[1][:2], env.reset_infos[1]["estimate"], rtol=1e-6)
-    assert seen == [0.1] * 4 + [0.5] * 9
-    with pytest.raises(ValueError, match="takes the place of what was given: give channel"):
-        draws.draw_from(downlink=[Channel()])
-    with pytest.raises(AttributeError, match=r"use vec_env\.vector_env"):
-        env.env_method("draw_from", [Channel()])
-
-
 def test_specification_of_vector_wrappers_makes_no_environments_without_them():
     envs = gym.make_vec(ID, num_envs=2)
     for other in (gym.make_vec(CLASSIC, num_envs=2), gym.make_vec(ID, num_envs=2, vectorization_mode="sync")):
@@ -102,10 +79,3 @@ def test_prices_of_wrappers_may_change_and_are_those_of_their_specs(make, name):
     with pytest.raises(ValueError, match=f"{name} must be a number >= 0"):
         setattr(env, name, -3.0)
     assert getattr(env, name) == 0.5
-
-
-def test_what_random_channels_draw_from_is_that_of_their_spec():
-    env = RandomChannel(gym.make(ID), [Channel(loss=0.1)])
-    assert gym.make(env.spec).reset(seed=0)[1]["channel_loss"] == 0.1
-    env.draw_from([Channel(loss=0.5)])
-    assert gym.make(env.spec).reset(seed=0)[1]["channel_loss"] == 0.5

@@ -1,29 +1,14 @@
-"""Trainings that go on from an agent, keep what they learned when they are interrupted, and learn what was applied."""
+"""Trainings that go on from an agent."""
 
 import copy
-import json
-from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback
 
-from agents import (
-    Agent,
-    AppliedActionBuffer,
-    LagrangianSettings,
-    LoopConfig,
-    ShieldSettings,
-    TrainingStopped,
-    train,
-)
-from agents.results import HISTORY_FILE, history_document
+from agents import LoopConfig, ShieldSettings, train
 from ncs_gym import truck_trailer
 from tests.certificates import certificate_of
-from tests.product import safety_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 SMALL = {"n_envs": 8, "n_steps": 16, "batch_size": 128, "n_epochs": 2}
@@ -33,19 +18,6 @@ REPLAY = {"n_envs": 4, "learning_starts": 40, "gradient_steps": 1, "buffer_size"
 @pytest.fixture(scope="module")
 def loop():
     return LoopConfig(env=CRUISE, shield=ShieldSettings(certificate_of(truck_trailer(mass=4000.0))))
-
-
-class Interrupting(BaseCallback):
-    """Ctrl-C, or what a callback raises in its place, after some steps."""
-
-    def __init__(self, kind):
-        super().__init__()
-        self._kind = kind
-
-    def _on_step(self):
-        if self.num_timesteps >= 1000:
-            raise self._kind
-        return True
 
 
 def test_training_goes_on_from_an_agent(loop):
@@ -75,92 +47,3 @@ def test_agent_that_a_training_goes_on_from_stays_as_it_is(loop, algorithm):
     for name, values in before.items():
         torch.testing.assert_close(after[name], values, rtol=0.0, atol=0.0)
     assert second.checksum == third.checksum
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("kind", [KeyboardInterrupt, TrainingStopped])
-def test_interrupted_training_leaves_what_it_learned(loop, tmp_path, kind):
-    with pytest.raises((KeyboardInterrupt, TrainingStopped)):
-        train(loop, 100_000, 0, hyperparams=SMALL, callbacks=[Interrupting(kind)], checkpoints=tmp_path)
-    assert json.loads((tmp_path / HISTORY_FILE).read_text())[-1]["steps"] == 1000
-    kept = Agent.load(tmp_path)
-    assert kept.act(np.zeros(3)).shape == (1,)
-    assert (tmp_path / "certificate.json").exists()
-    assert train(loop, 128, 0, hyperparams=SMALL, start=kept).steps == 128
-
-
-def test_history_makes_two_trainings_count_as_one(loop):
-    first = train(loop, 512, 0, hyperparams=SMALL)
-    second = train(loop, 512, 1, hyperparams=SMALL, start=first.agent, history=first.history)
-    assert second.steps == 1024
-    assert second.history[: len(first.history)] == first.history
-    assert second.history[-1].steps == 1024
-    assert second.interventions >= first.interventions > 0
-    rate = second.agent.model.policy.optimizer.param_groups[0]["lr"]
-    whole = train(loop, 1024, 0, hyperparams=SMALL).agent.model.policy.optimizer.param_groups[0]["lr"]
-    assert rate == pytest.approx(whole)
-
-
-def test_price_of_violations_goes_on_with_the_history():
-    loop = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0", lagrangian=LagrangianSettings(learning_rate=0.5))
-    first = train(loop, 1600, 0, hyperparams=SMALL)
-    reached = first.history[-1].multiplier
-    second = train(loop, 64, 1, hyperparams=SMALL, start=first.agent, history=first.history)
-    assert second.history[-1].multiplier >= reached > 0.0
-    assert json.loads(history_document(second.history))[-1]["multiplier"] >= reached
-    assert train(loop, 64, 1, hyperparams=SMALL, start=first.agent).history[-1].multiplier < reached
-    # The totals of another training have no price: that of the settings counts.
-    plain = train(replace(loop, lagrangian=None), 64, 0, hyperparams=SMALL)
-    assert np.isnan(plain.history[-1].multiplier)
-    dear = replace(loop, lagrangian=LagrangianSettings(multiplier=2.0))
-    third = train(dear, 64, 1, hyperparams=SMALL, start=plain.agent, history=plain.history)
-    assert third.history[-1].multiplier >= 2.0
-
-
-def test_training_leaves_checkpoints_on_the_way(loop, tmp_path):
-    class Looking(BaseCallback):
-        seen = 0
-
-        def _on_step(self):
-            Looking.seen += (tmp_path / "agent.json").exists()
-            return True
-
-    result = train(loop, 1280, 0, hyperparams=SMALL, callbacks=[Looking()], checkpoints=tmp_path)
-    assert Looking.seen > 100
-    assert Agent.load(tmp_path).checksum == result.agent.checksum
-    assert (tmp_path / HISTORY_FILE).read_text() == history_document(result.history)
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("algorithm", ["SAC", "TD3"])
-def test_replay_buffers_hold_what_was_applied_if_asked_to(loop, algorithm):
-    class Keeping(BaseCallback):
-        def __init__(self):
-            super().__init__()
-            self.applied = []
-
-        def _on_step(self):
-            self.applied += self.training_env.unwrapped.batch_info["input"].tolist()
-            return True
-
-    keeping, limit = Keeping(), truck_trailer().u_max
-    agent = train(loop, 120, 0, algorithm, REPLAY | {"stored_action": "applied"}, callbacks=[keeping]).agent
-    stored = agent.model.replay_buffer
-    actions = stored.actions[: stored.pos].reshape(-1, 1)
-    np.testing.assert_allclose(actions * limit, np.array(keeping.applied), atol=1e-5)
-    proposed = train(loop, 120, 0, algorithm, REPLAY).agent.model.replay_buffer
-    assert not np.allclose(proposed.actions[: stored.pos].reshape(-1, 1), actions, atol=1e-3)
-
-
-def test_replay_buffers_refuse_actions_that_a_wrapper_outside_changes():
-    def learn(env):
-        model = SAC("MlpPolicy", env, learning_starts=50, replay_buffer_class=AppliedActionBuffer, seed=0)
-        model.learn(60)
-
-    def shield():
-        return safety_shield(gym.make(CRUISE))
-
-    learn(gym.wrappers.RescaleAction(shield(), np.float32(-3.0), np.float32(5.0)))  # stable-baselines3 scales, too
-    turned = gym.wrappers.TransformAction(shield(), lambda action: -0.5 * action, None)
-    with pytest.raises(ValueError, match="a wrapper outside the shield changes actions"):
-        learn(turned)

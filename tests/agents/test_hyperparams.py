@@ -8,7 +8,7 @@ import pytest
 from torch import nn
 
 import agents
-from agents import Agent, AgentError, LoopConfig, tuned_hyperparams, tuned_steps, untrained
+from agents import Agent, LoopConfig, tuned_hyperparams, tuned_steps, untrained
 from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
 from ncs_gym.registration import ENVIRONMENTS, needing_extras, registered_ids
 
@@ -20,26 +20,15 @@ DEFAULT = {
 OWN = [env_id for env_id in ENVIRONMENTS if env_id in {*registered_ids(), *needing_extras()} - DEFAULT]
 
 
-@pytest.mark.parametrize("env_id", OWN)
-def test_registered_environment_has_tuned_hyperparameters(env_id):
-    tuned = tuned_hyperparams(env_id)
-    assert tuned is not None
-    assert tuned.keys() == DEFAULTS["PPO"].keys()
-    assert tuned_steps(env_id) >= 100_000
-
-
-def test_file_names_registered_environments_only():
+def test_tuned_are_registered_environments():
     assert set(json.loads((Path(agents.__file__).parent / "tuned" / "ppo.json").read_text())) == set(OWN)
     assert len(OWN) == 9
+    for env_id in OWN:
+        assert tuned_hyperparams(env_id).keys() == DEFAULTS["PPO"].keys()
+        assert tuned_steps(env_id) >= 100_000
 
 
-@pytest.mark.parametrize(
-    "given",
-    [
-        *((env_id,) for env_id in ("ncs_gym/LinearNCS-v0", "Plants/Tanks-v0", "ncs_gym:ncs_gym/CartPole-v0")),
-        *(("ncs_gym/CartPole-v0", algorithm) for algorithm in ("TRPO", "A2C", "SAC", "TD3", "../ppo")),
-    ],
-)
+@pytest.mark.parametrize("given", [("ncs_gym/LinearNCS-v0",), ("ncs_gym/CartPole-v0", "SAC")])
 def test_plant_of_ones_own_and_algorithm_that_was_not_tuned_have_none(given):
     assert tuned_hyperparams(*given) is None
     assert tuned_steps(*given) is None
@@ -53,16 +42,10 @@ def test_part_of_the_networks_arguments_may_be_changed():
     assert DEFAULTS["PPO"]["policy_kwargs"]["net_arch"] == [64, 64]
 
 
-@pytest.mark.parametrize(("name", "kind"), [("nn.ReLU", nn.ReLU), ("GELU", nn.GELU)])
-@pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
+@pytest.mark.parametrize(("name", "kind", "algorithm"), [("nn.ReLU", nn.ReLU, "PPO"), ("GELU", nn.GELU, "SAC")])
 def test_activation_function_is_that_of_torch_and_survives_the_files(name, kind, algorithm, tmp_path):
     policy = {"net_arch": [8], "activation_fn": name}
-    agent = untrained(
-        LoopConfig(env=CRUISE),
-        algorithm=algorithm,
-        seed=0,
-        hyperparams={"policy_kwargs": policy},
-    )
+    agent = untrained(LoopConfig(env=CRUISE), 0, algorithm, {"policy_kwargs": policy})
     assert any(isinstance(module, kind) for module in agent.model.policy.modules())
     agent.save(tmp_path)
     again = Agent.load(tmp_path)
@@ -70,24 +53,7 @@ def test_activation_function_is_that_of_torch_and_survives_the_files(name, kind,
     np.testing.assert_array_equal(again.act(observations), agent.act(observations))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "nn.Linear",
-        "nn.Module",
-        "os.system",
-        "nn.modules",
-        "nn.__doc__",
-        "",
-        3,
-    ],
-)
+@pytest.mark.parametrize("name", ["nn.Linear", "os.system", "nn.__doc__", "", 3])
 def test_what_is_no_activation_function_is_named(name):
-    with pytest.raises(ValueError, match="no activation function") as caught:
-        untrained(
-            LoopConfig(env=CRUISE),
-            seed=0,
-            hyperparams={"policy_kwargs": {"activation_fn": name}},
-        )
-    assert "\n" not in str(caught.value)
-    assert not isinstance(caught.value, AgentError)
+    with pytest.raises(ValueError, match="no activation function"):
+        untrained(LoopConfig(env=CRUISE), 0, hyperparams={"policy_kwargs": {"activation_fn": name}})

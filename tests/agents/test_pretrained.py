@@ -3,9 +3,7 @@
 import json
 
 import gymnasium as gym
-import numpy as np
 import pytest
-from stable_baselines3.common.evaluation import evaluate_policy
 
 from agents import AgentError, LoopConfig, ShieldSettings, evaluate, pretrained, pretrained_folder
 from benchmarks.learning import PACKAGE_SEED, seeds_of
@@ -46,15 +44,6 @@ def test_every_agent_keeps_its_plant_safe_behind_its_shield(env_id):
     loop = LoopConfig(env=env_id, shield=ShieldSettings(certificate, "project", on_unproved="raise"))
     episode = evaluate(loop, lambda observations, infos: agent.act(observations), 1, seed=0).episodes[0]
     assert (episode.steps, episode.violation_steps, episode.guaranteed) == (200, 0, True)
-
-
-def test_agent_is_evaluated_as_a_model_of_stable_baselines3():
-    agent = pretrained("ncs_gym/CSTR-v0")
-    env = LoopConfig(env=agent.env).single()
-    mean, _ = evaluate_policy(agent, env, n_eval_episodes=1, warn=False)
-    assert np.isfinite(mean)
-    with pytest.raises(ValueError, match="act deterministically"):
-        agent.predict(env.reset(seed=0)[0], deterministic=False)
 
 
 def test_ids_without_an_agent_are_one_sentence(tmp_path):

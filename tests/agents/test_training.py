@@ -1,4 +1,3 @@
-from dataclasses import astuple
 from functools import cache
 
 import gymnasium as gym
@@ -127,27 +126,6 @@ def test_missing_package_is_one_sentence(monkeypatch):
         train(CRUISE, 64, 0, "TQC", TINY_REPLAY)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("algorithm", "settings"), [("PPO", TINY), ("SAC", TINY_REPLAY)])
-def test_rates_reach_tensorboard_and_logs_change_nothing(algorithm, settings, tmp_path):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    steps = 1024
-    result = train(shielded(), steps, 5, algorithm, settings, log_folder=tmp_path)
-    events = EventAccumulator(str(tmp_path))
-    events.Reload()
-    tags = events.Tags()["scalars"]
-    assert {"safety/violation_rate", "safety/intervention_rate", "safety/violation_steps", "time/fps"} <= set(tags)
-    assert max(event.value for event in events.Scalars("safety/mean_correction")) > 0.0
-    assert {event.value for event in events.Scalars("safety/guaranteed_rate")} == {1.0}
-    if algorithm == "PPO":
-        rates = [event.value for event in events.Scalars("safety/intervention_rate")]
-        assert sum(rates) * 256 == pytest.approx(result.interventions, abs=1)
-    plain = train(shielded(), steps, 5, algorithm, settings)
-    assert plain.agent.checksum == result.agent.checksum
-    np.testing.assert_array_equal([astuple(one) for one in plain.history], [astuple(one) for one in result.history])
-
-
 class Dumps(KVWriter):
     """What reaches a log, and at which step."""
 
@@ -170,7 +148,7 @@ class Steps(BaseCallback):
 
     def _on_step(self):
         names = "cost", "shield_intervened", "shield_correction", "shield_guaranteed"
-        self.rows.append([[float(info[name]) for name in names] for info in self.locals["infos"]])
+        self.rows.append([[float(info.get(name, 0.0)) for name in names] for info in self.locals["infos"]])
         return True
 
 
@@ -220,23 +198,11 @@ def test_what_the_library_takes_is_not_refused():
     require_trainable(CRUISE, 100_000, "SAC", {"ent_coef": 0.1, "noise_std": 0.1})
 
 
-class Totals(BaseCallback):
-    """Sums of what the infos of all environments say themselves."""
-
-    violations = interventions = 0
-
-    def _on_step(self) -> bool:
-        for info in self.locals["infos"]:
-            self.violations += info["cost"] > 0.0
-            self.interventions += info.get("shield_intervened", False)
-        return True
-
-
 @pytest.mark.parametrize("order", [1, -1], ids=["bare first", "shielded first"])
 def test_overrides_are_counted_where_only_some_environments_have_a_shield(order, certificate):
     makes = [lambda: gym.make(CRUISE.env), lambda: safety_shield(gym.make(CRUISE.env), certificate)]
-    counted, totals = SafetyCallback(), Totals()
+    counted, steps = SafetyCallback(), Steps()
     model = PPO("MlpPolicy", DummyVecEnv(makes[::order]), n_steps=64, batch_size=64, n_epochs=1, seed=0)
-    model.learn(256, callback=[counted, totals])
-    assert (counted.interventions, counted.violation_steps) == (totals.interventions, totals.violations)
+    model.learn(256, callback=[counted, steps])
+    assert [counted.violation_steps, counted.interventions] == np.sum(steps.rows, axis=(0, 1))[:2].tolist()
     assert counted.interventions > 10

@@ -39,10 +39,16 @@ def training_run(certificate: Certificate, shield: str | None = None, **change: 
     return TrainingRun(**common | content | change)
 
 
+def episode(index: int, total: float, violating: int, estimated: int, overridden: int) -> Episode:
+    """An episode of 10 steps inside of the safe set, whose guarantee held."""
+    counts = {"violation_steps": violating, "estimate_violation_steps": estimated, "interventions": overridden}
+    return Episode(index=index, steps=10, episode_return=total, **counts, times_safe_set=0.9, guaranteed=True)
+
+
 def run(arm: str, index: int = 0, violations=(0, 0), returns=(-1.0, -3.0), **change: Any) -> RunResult:
     """A run of an arm with an episode of 10 steps for each number of violating steps."""
     episodes = [
-        Episode(i, 10, total - index, count, count, 1, True, 0.9)
+        episode(i, total - index, count, count, 1)
         for i, (count, total) in enumerate(zip(violations, returns, strict=True))
     ]
     content = {

@@ -13,14 +13,9 @@ def channel_of(*arguments):
     ("text", "value"),
     [
         ("0.5", 0.5),
-        ("3", 3),
         ("null", None),
-        ("true", True),
-        ("[64, 64]", [64, 64]),
         ('{"pi": [64]}', {"pi": [64]}),
-        ("1e-3", 0.001),
         ("lin_0.1", "lin_0.1"),
-        ('"lin_0.1"', "lin_0.1"),
         ("nn.ReLU", "nn.ReLU"),
     ],
 )
@@ -30,7 +25,7 @@ def test_value_is_a_json_value_or_a_word(text, value):
     assert type(given["loss"]) is type(value)
 
 
-@pytest.mark.parametrize("text", ["dict(a=1)", "{1, 2}", "[64", "{'a': 1}", "", "a b"])
+@pytest.mark.parametrize("text", ["dict(a=1)", "[64", "", "a b"])
 def test_what_is_neither_names_the_form(text, capsys):
     with pytest.raises(SystemExit):
         channel_of("--channel", f"loss={text}")

@@ -33,29 +33,13 @@ def test_steps_are_those_given_or_tuned_or_the_default():
     assert CompareSettings(env=CART_POLE).completed.steps == 600_000
 
 
-def test_steps_are_a_hyperparameter_too():
-    assert CompareSettings(hyperparams={"n_timesteps": 3e4}).training_steps == 30_000
-    assert CompareSettings(hyperparams={"n_timesteps": 3e4}, steps=7).training_steps == 7
-    assert "n_timesteps" not in CompareSettings(hyperparams={"n_timesteps": 3e4}).all_hyperparams
-    for steps in (0, 1.5, True, "many", 1e16):
-        with pytest.raises(ValueError, match="n_timesteps must be a whole number >= 1, got"):
-            CompareSettings(hyperparams={"n_timesteps": steps}).training_steps  # noqa: B018
-
-
-def test_what_is_given_wins_over_the_tuned_value_also_if_it_equals_the_default():
-    default, tuned = DEFAULTS["PPO"]["gamma"], tuned_hyperparams(CART_POLE)
-    assert tuned["gamma"] != default
-    settings = parse(["compare", "--env", CART_POLE, "--hyperparams", f"gamma={default}"])
-    assert settings.all_hyperparams == tuned | {"gamma": default}
-    assert f"tuned for {CART_POLE}, as given gamma: " in settings.agent_line
-
-
 def test_what_is_given_wins_over_the_tuned_values():
-    given = ["n_timesteps=5000", "gamma=0.7", "n_steps=8", 'policy_kwargs={"net_arch": [8]}']
-    settings = parse(["train", "--env", CART_POLE, "--hyperparams", *given])
+    given = ["gamma=0.9", "n_steps=8", 'policy_kwargs={"net_arch": [8]}']
+    settings = parse(["train", "--env", CART_POLE, "--steps", "5000", "--hyperparams", *given])
     tuned = tuned_hyperparams(CART_POLE)
     networks = tuned["policy_kwargs"] | {"net_arch": [8]}
-    expected = tuned | {"gamma": 0.7, "n_steps": 8, "policy_kwargs": networks}
+    expected = tuned | {"gamma": DEFAULTS["PPO"]["gamma"], "n_steps": 8, "policy_kwargs": networks}
+    assert tuned["gamma"] != DEFAULTS["PPO"]["gamma"] == 0.9
     assert settings.all_hyperparams == expected
     assert settings.training_steps == 5000
     assert "as given gamma, policy_kwargs, n_steps: " in settings.agent_line

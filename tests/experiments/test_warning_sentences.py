@@ -3,33 +3,15 @@
 import re
 import sys
 import warnings
-from queue import Queue
 
-import pytest
 from tqdm import tqdm
 
-from experiments.terminal import warnings_as_sentences, warnings_sent
-from tests.command import ncs
-
-# Samples may become older than the contract allows from a delay of 5 steps on.
-SWEEP = ("sweep", "--env", "ncs_gym/CartPole-v0", "--losses", 0, "--delays", 8, 9, "--seeds", 1, "--episodes", 1)
-SWEEP += ("--arms", "lqr+shielded", "lqr+lookahead")
+from experiments.terminal import warnings_as_sentences
 
 
 def lines_of(text):
     """The lines that stand on a terminal at some time: a carriage return begins a line anew."""
     return [line for line in re.split(r"[\r\n]", text) if line.strip()]
-
-
-@pytest.mark.slow
-def test_warning_of_worker_processes_is_a_sentence_that_is_said_once_for_each_delay(tmp_path):
-    run = ncs(*SWEEP, "--jobs", 2, "--out", tmp_path)
-    assert run.returncode == 0, run.stderr
-    said = [line for line in lines_of(run.stderr) if "is likely to be lost" in line]
-    starts = [f"ncs: warning: the channel lets the newest sample become {age} steps old" for age in (8, 9)]
-    assert [line.partition(",")[0] for line in sorted(said)] == starts
-    assert "Warning" not in run.stderr
-    assert ".py" not in run.stderr
 
 
 def test_progress_bar_is_cleared_before_a_sentence(capsys):
@@ -39,10 +21,3 @@ def test_progress_bar_is_cleared_before_a_sentence(capsys):
             warnings.warn(text, stacklevel=1)
     said = [line for line in lines_of(capsys.readouterr().err) if "warning" in line]
     assert said == ["ncs: warning: one sentence", "ncs: warning: another"]
-
-
-def test_warnings_of_a_worker_reach_the_command():
-    sent: Queue = Queue()
-    with warnings_sent(sent.put):
-        warnings.warn("from a run", stacklevel=1)
-    assert sent.get_nowait() == "from a run"

@@ -58,8 +58,3 @@ def test_plant_that_is_registered_gets_a_page(pages):
     assert "lost with probability 0.25. What is not lost arrives 3 steps late." in section(page, "Channel and contract")
     assert "truncated after 77 steps" in section(page, "Episode end")
     assert "| 0 | u1 | 2 |" in section(page, "Action space")
-
-
-def test_environment_of_another_package_has_no_page(pages):
-    with pytest.raises(ValueError, match="not an environment of this package"):
-        pages.environment_page("CartPole-v1")

@@ -1,4 +1,4 @@
-/* Written by `ncs export-c` from certificate @CERTIFICATE@
+/* Written by `ncs verify --c` from certificate @CERTIFICATE@
    of the plant with fingerprint @FINGERPRINT@. */
 #include "ncs_filter.h"
 

@@ -1,4 +1,4 @@
-/* A safety filter with its estimator, written by `ncs export-c` (documentation: "Deployment and C"). No heap, no libm.
+/* A safety filter with its estimator, written by `ncs verify --c` (documentation: "Deployment and C"). No heap, no libm.
 
    Once per control step: ncs_receive for each sample that has arrived, the oldest first, then ncs_decide, whose input
    acts at once, until the next step. Samples carry the number of the step at which they were taken, and that of the

@@ -17,6 +17,7 @@ def test_text_follows_the_terminal_between_60_and_80_columns(monkeypatch, column
     assert " ".join([first, *rest]).split() == SENTENCE.split()
 
 
-def test_long_words_and_hyphens_are_not_broken():
+def test_long_words_and_hyphens_are_not_broken(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
     path = "/".join(["folder-with-hyphens"] * 8)
-    assert path in wrapped(f"the files are in {path} for now", 60).splitlines()[1]
+    assert path in wrapped(f"the files are in {path} for now").splitlines()[1]

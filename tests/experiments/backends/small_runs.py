@@ -7,27 +7,13 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from experiments.errors import RunStopped
-
-
-@dataclass(frozen=True)
-class Said:
-    """What a run did."""
-
-    text: str
-    files: dict[str, bytes] = field(default_factory=dict)
-
-    @classmethod
-    def of_json(cls, values: dict[str, Any]) -> Said:
-        return cls(**values)
-
-    @property
-    def outcome(self) -> str:
-        return self.text
+from experiments.runs.training_run import RunResult
+from tests.experiments.results import run
 
 
 @dataclass(frozen=True)
@@ -40,16 +26,13 @@ class Small:
     awaits: str = ""
 
     total_steps = 5
-    parts = ("waiting",)
-    unit = "step"
-    leaves = ()
-    result_type = Said
+    trains = False
 
     @property
     def key(self) -> str:
         return f"{self.name} {self.does}"
 
-    def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> Said:
+    def execute(self, on_progress: Callable[[int], None], log_folder: Path | None = None) -> RunResult:
         while self.awaits and not (self.folder / self.awaits).exists():
             time.sleep(0.01)
         with (self.folder / f"{self.name} began").open("a") as file:
@@ -67,7 +50,7 @@ class Small:
             raise
         warnings.warn(f"{self.name} warns", stacklevel=1)
         on_progress(5)
-        return Said(f"{self.name} said so")
+        return run(f"{self.name} said so")
 
 
 def waiting(settings: Any) -> None:

@@ -33,25 +33,14 @@ def stored(folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("jobs", [2, 1])
-def test_results_are_those_of_this_process_whatever_the_number_of_jobs(jobs, certificate, tmp_path):
-    runs = [training_run(certificate, arm="random", policy_kind="random", index=index) for index in range(3)]
-    results = results_of(runs, tmp_path, BackendSettings(jobs=jobs))
-    for run, result in zip(runs, results, strict=True):
-        alone = run.execute(lambda steps: None)
-        assert result.episodes == alone.episodes
-    assert results[0].episodes != results[1].episodes
-
-
-@pytest.mark.slow
 def test_finished_runs_are_kept_and_not_executed_again(tmp_path, capsys):
     runs = [Small(name, "work", tmp_path) for name in "abc"]
     with pytest.warns(UserWarning, match=r"[ab] warns"):
-        assert [result.text for result in results_of(runs[:2], tmp_path, TWO)] == ["a said so", "b said so"]
-    assert "waiting: 100%" in capsys.readouterr().err
+        assert [result.arm for result in results_of(runs[:2], tmp_path, TWO)] == ["a said so", "b said so"]
+    assert "evaluation: 100%" in capsys.readouterr().err
     (tmp_path / "a began").unlink()
     with pytest.warns(UserWarning, match="c warns"):
-        assert [result.text[0] for result in results_of(runs[::-1], tmp_path, TWO)] == ["c", "b", "a"]
+        assert [result.arm[0] for result in results_of(runs[::-1], tmp_path, TWO)] == ["c", "b", "a"]
     assert not (tmp_path / "a began").exists()
     assert "2 of 3 runs were finished before" in capsys.readouterr().err
 

@@ -133,25 +133,6 @@ def test_rows_are_those_of_the_local_engine_bit_for_bit(local, tmp_path):
     assert len(noise) == RUNS, run.stderr
 
 
-def test_killed_driver_leaves_no_process_and_goes_on_where_it_was(local, tmp_path):
-    out = tmp_path / "out"
-    run = started("sweep", *GRID, "--engine", "ray", "--out", out)
-    until_stored(out, 2, run)
-    processes = descendants(run.pid)
-    assert any(title == "ray::_on_node" for title in processes.values())
-    run.kill()
-    run.communicate()
-    until(lambda: not any(map(is_alive, processes)), f"processes outlive their driver: {processes}")
-    assert not (out / "summary.json").exists()
-    finished = stored(out)
-    assert 2 <= finished < RUNS
-    again = ncs("sweep", *GRID, "--engine", "ray", "--out", out)
-    assert again.returncode == 0, again.stderr
-    assert f"{finished} of {RUNS} runs were finished before" in again.stderr
-    assert len(set(lines_of_runs(again.stderr))) == len(lines_of_runs(again.stderr)) == RUNS - finished
-    assert_same(out, local)
-
-
 def test_worker_that_always_dies_is_given_up_and_named(tmp_path):
     run = Small("its-name", "die", tmp_path)
     with pytest.raises(RunError, match="worker processes died in its-name"):

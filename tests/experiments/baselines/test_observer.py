@@ -4,12 +4,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents import LoopConfig, evaluate
-from experiments.baselines import RegulatorWeights, controller
+from experiments.baselines.controllers import RegulatorWeights, controller
 from experiments.baselines.observer import DisturbanceObserver
 from experiments.runs.policies import policy_by_name
 from ncs_gym import Channel, SetpointTracking
-from ncs_gym.envs.env import ncs_env
 from shields.certificate import Fallback
 from tests.product import gym_vector_env, linear_plant, loop_env
 
@@ -104,22 +102,6 @@ def test_estimates_stay_within_the_bound_and_begin_anew_with_an_episode():
         *_, infos = envs.step(np.zeros((2, 1), np.float32))
     infos["estimate"] = infos["estimate"] + 0.5
     np.testing.assert_allclose(np.abs(observer.see(infos)[1]), np.tile(largest, (2, 1)))
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("env_id", ["ncs_gym/Convoy-v0", "ncs_gym/CartPoleTwoWay-v0", "ncs_gym/TruckTrailerCruise-v0"])
-def test_without_gain_the_observer_changes_nothing(env_id):
-    env, loop = ncs_env(gym.make(env_id)), LoopConfig(env=env_id)
-    for name in ("lqr", "mpc"):
-        nothing, observed, plain = (
-            [each.episode_return for each in evaluate(loop, controller(*made), 2, 0).episodes]
-            for made in (
-                (f"{name}:observer", env, fallback(env), 0, RegulatorWeights(disturbance=0.0)),
-                (f"{name}:observer", env, fallback(env), 0),
-                (name, env, fallback(env), 0),
-            )
-        )
-        assert nothing == plain != observed
 
 
 def test_a_single_environment_is_observed_like_many():

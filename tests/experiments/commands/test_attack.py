@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from experiments.commands.attack import attacked, channels_of, hostile_agents, starts, worst_case
-from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant
+from ncs_gym import Channel, ChannelContract, Ellipsoid
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.registration import needing_extras
 from shields import VectorSafetyShield, certificate_for
-from tests.certificates import certificate_of
 from tests.command import ncs, succeeded
-from tests.product import linear_plant, vector_env, vector_shield
+from tests.product import vector_shield
 
 CRUISE, CART, REACTOR = (f"ncs_gym/{name}-v0" for name in ("TruckTrailerCruise", "CartPole", "BatchReactor"))
 
@@ -51,12 +50,6 @@ def test_table_has_every_channel_and_their_sum(tmp_path):
         assert rows[name.removeprefix("CartPole-v0, ")][5] == f"{counts['overridden'] / 1600:.1%}"
         assert counts["overridden"] > 0.25 * counts["steps"]
         assert counts["outside S"] == counts["guaranteed outside S"] == counts["lost"] == 0
-
-
-def test_a_short_version_attacks_one_environment():
-    run = succeeded("attack", "--smoke")
-    assert list(rows_of(run)) == ["own", "blackout", "all"]
-    assert rows_of(run)["all"][:2] == ["3,200", "16"]
 
 
 def test_the_attack_does_harm_where_the_shield_only_watches():
@@ -147,58 +140,6 @@ def test_agents_are_random_outward_turned_round_and_bang_bang():
     np.testing.assert_array_equal(first[2:4], np.sign(growing[2:4]))
     np.testing.assert_array_equal(np.sign(first[4:6]), -np.sign(estimates[4:6] @ certificate.K.T))
     np.testing.assert_array_equal(np.abs(first[6:]), 1.0)
-
-
-COUNT = 32
-SLANTED = np.array([[4e-4, 1e-4], [1e-4, 1e-4]])
-ACROSS, ALONG = np.array([[1.0], [2.0]]), np.array([[1.0, 0.0], [1.0, 1.0]])
-
-
-def plant_with(**first_error) -> LinearPlant:
-    """A plant in the unit box whose first error is bounded in the way given."""
-    return linear_plant(
-        A=[[0.9, 0.1], [0.0, 0.8]],
-        B=[[0.0], [0.1]],
-        H=[[1.0, 0.0]],
-        box=[1.0, 1.0],
-        u_max=2.0,
-        dt=0.1,
-        disturbance_bound=0.002,
-        sensor_bound=0.002,
-        **first_error,
-    )
-
-
-def first_errors(plant: LinearPlant) -> np.ndarray:
-    """First errors of the attack, shape (COUNT, n); no step of it breaks an assumption."""
-    certificate = certificate_of(plant)
-    many = vector_env(COUNT, plant=plant, channel=Channel(), **worst_case(certificate))
-    env = vector_shield(many, certificate)
-    _, info = env.reset(seed=0, options={"state": starts(certificate, np.random.default_rng(0), COUNT)})
-    errors = info["estimation_error"]
-    for _ in range(20):
-        *_, info = env.step(np.ones((COUNT, 1), np.float32))
-        assert not info["assumption_violated"].any()
-        assert info["shield_guaranteed"].all()
-    return errors
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize(
-    ("bound", "use"),
-    [
-        (0.02, lambda e: np.linalg.norm(e, axis=1) / 0.02),
-        ([0.01, 0.03], lambda e: np.linalg.norm(e / [0.01, 0.03], axis=1) / np.sqrt(2.0)),
-        (Ellipsoid(SLANTED), lambda e: np.sqrt(np.einsum("ij,ji->i", e, np.linalg.solve(SLANTED, e.T)))),
-        ((ACROSS, 0.01), lambda e: np.abs(e[:, 0]) / 0.01 + np.abs(e[:, 1] - 2.0 * e[:, 0])),
-        ((ALONG, [0.01, 0.02]), lambda e: np.hypot(e[:, 0] / 0.01, (e[:, 1] - e[:, 0]) / 0.02) / np.sqrt(2.0)),
-    ],
-    ids=["number", "half-widths", "ellipsoid", "one direction", "two directions"],
-)
-def test_first_errors_attain_the_declared_bound(bound, use):
-    errors = first_errors(plant_with(initial_bound=bound))
-    np.testing.assert_allclose(use(errors), 1.0, atol=1e-6)
-    assert np.ptp(errors, axis=0).min() > 0.0
 
 
 def assert_safe(counts):

@@ -7,13 +7,13 @@ import pytest
 from agents import tuned_hyperparams
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig
-from agents.results import Episode
 from experiments.analysis.episodes import arm_summary, episodes_table, paired_differences
 from experiments.commands.compare import CompareSettings, shortened
 from experiments.commands.train import TrainSettings, train
 from experiments.report.text_tables import summary_text
 from experiments.runs.arms import full_names, require_arms, run_of_arm
 from experiments.runs.training_run import RunResult
+from tests.experiments.results import episode
 
 ALL_ARMS = ("unshielded", "monitor", "penalized", "shielded", "shielded:switch+penalty", "shielded:boundary")
 
@@ -32,6 +32,7 @@ def test_runs_with_equal_numbers_are_paired_across_arms_and_differ_from_each_oth
     for run in runs_of(certificate, arms=ALL_ARMS):
         seeds.setdefault(run.index, set()).add((run.training_seed, run.evaluation_seed))
     assert {len(pairs) for pairs in seeds.values()} == {1}
+    assert all(0 <= run.training_seed < 2**31 for run in runs_of(certificate, seed=2**63))
     flat = [number for pairs in seeds.values() for pair in pairs for number in pair]
     assert len(set(flat)) == len(flat) == 6
 
@@ -46,51 +47,24 @@ def test_a_smoke_run_evaluates_the_pretrained_agent_unless_something_else_is_ask
     assert shortened(CompareSettings()) == CompareSettings()
 
 
-@pytest.mark.parametrize("seed", [0, 10**9, 2**63])
-def test_any_seed_is_usable(certificate, seed):
-    for run in runs_of(certificate, seed=seed):
-        assert 0 <= run.training_seed < 2**31
-        assert 0 <= run.evaluation_seed < 2**31
-
-
 def test_each_arm_has_its_shield_and_its_penalties(certificate):
     chosen = runs_of(
         certificate, arms=ALL_ARMS, seeds=1, mode="switch", intervention_penalty=0.3, violation_penalty=2.0
     )
     loops = {run.arm: run.training_loop for run in chosen}
-    modes = {name: loop.shield and loop.shield.mode for name, loop in loops.items()}
-    assert modes == {
-        "unshielded": None,
-        "monitor": "monitor",
-        "penalized": None,
-        "shielded": "switch",
-        "shielded:switch+penalty": "switch",
-        "shielded:boundary": "boundary",
-        "zero input": None,
-        "K x_hat": None,
-        "untrained": None,
-        "lqr": None,
-        "lqr+trusting": None,
-        "lqr+shielded": "switch",
-    }
+    modes = {name: loop.shield.mode for name, loop in loops.items() if loop.shield}
+    switched = dict.fromkeys(("shielded", "shielded:switch+penalty", "lqr+shielded"), "switch")
+    assert modes == switched | {"monitor": "monitor", "shielded:boundary": "boundary"}
     penalized = {name for name, loop in loops.items() if loop.shield and loop.shield.penalty == 0.3}
     assert penalized == {"shielded:switch+penalty"}
     assert {name for name, loop in loops.items() if loop.violation_penalty == 2.0} == {"penalized"}
 
 
 def test_lookahead_is_an_arm_by_two_names_and_alone_takes_the_horizon(certificate):
-    arms = ("unshielded", "monitor", "shielded", "lookahead", "lookahead+penalty", "shielded:lookahead")
-    loops = {
-        run.arm: run.training_loop
-        for run in runs_of(certificate, arms=arms, seeds=1, horizon=4, intervention_penalty=0.3)
-    }
-    for name in arms[3:]:
-        assert (loops[name].shield.mode, loops[name].shield.horizon) == ("lookahead", 4)
-        assert loops[name].shield.penalty == (0.3 if name.endswith("+penalty") else 0.0)
-    for name in set(loops) - set(arms[3:]):
-        assert loops[name].shield is None or loops[name].shield.horizon is None
-    by_mode = runs_of(certificate, arms=("shielded",), seeds=1, mode="lookahead")
-    assert (by_mode[0].loop.shield.mode, by_mode[0].loop.shield.horizon) == ("lookahead", 6)
+    arms = ("shielded", "lookahead", "lookahead+penalty", "shielded:lookahead")
+    loops = {run.arm: run.training_loop for run in runs_of(certificate, arms=arms, seeds=1, horizon=4)}
+    assert [(loops[name].shield.mode, loops[name].shield.horizon) for name in arms[1:]] == [("lookahead", 4)] * 3
+    assert loops["shielded"].shield.horizon is None
     keys = {runs_of(certificate, arms=("lookahead",), seeds=1, horizon=horizon)[0].key for horizon in (None, 4, 5)}
     assert len(keys) == 3
 
@@ -159,8 +133,7 @@ def test_one_agent_has_one_algorithm():
 
 def result(returns, violations, interventions=0, index=0):
     episodes = [
-        Episode(i, 10, r, v, 2 * v, interventions, True, 0.5)
-        for i, (r, v) in enumerate(zip(returns, violations, strict=True))
+        episode(i, r, v, 2 * v, interventions) for i, (r, v) in enumerate(zip(returns, violations, strict=True))
     ]
     return RunResult("arm", index, 100, 4, 20, [], episodes)
 

@@ -120,7 +120,7 @@ def test_own_plant_is_trained_in_and_evaluated_by_its_id(folder, without_workers
     assert settings["settings"]["hyperparams"] == complete_hyperparams("PPO", dict(n_steps=16, n_envs=2))
     assert "PPO, default hyperparameters, as given n_envs, n_steps:" in run.stdout
     model = next((folder / "r" / "models").iterdir())
-    assert json.loads((model / "agent.json").read_text())["agent"]["env"] == "Plants/Truck-v0"
+    assert json.loads((model / "agent.json").read_text())["env"] == "Plants/Truck-v0"
     succeeded("evaluate", model, *ENV, "--episodes", 2, cwd=folder)
     other = ncs("evaluate", model, "--env", "ncs_gym/TruckTrailer-v0", cwd=folder)
     assert_one_sentence(other, "was trained in Plants/Truck-v0, not in ncs_gym/TruckTrailer-v0")
@@ -142,15 +142,9 @@ def test_plant_of_a_file_under_a_contract(plant_file, tmp_path):
     assert (contract.max_age, contract.quantization_step) == (2, 0.001)
     alone = ncs("synthesize", "--plant", plant_file.name, "--quantization-step", 0.001, cwd=tmp_path)
     assert_one_sentence(alone, "give --max-age, too")
-
-
-@pytest.mark.parametrize("command", [("synthesize",), ("verify", "certificate.json")])
-def test_plant_of_a_file_is_no_environment(command, tmp_path, certificate):
-    certificate.save(tmp_path / "certificate.json")
-    both = ncs(*command, "--plant", "p.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=tmp_path)
-    assert both.returncode == 2
-    assert "not both" in both.stderr
-    missing = ncs(*command, "--plant", "nowhere.json", cwd=tmp_path)
+    both = ncs("synthesize", "--plant", "p.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=tmp_path)
+    assert (both.returncode, "not both" in both.stderr) == (2, True)
+    missing = ncs("verify", "certificate.json", "--plant", "nowhere.json", cwd=tmp_path)
     assert_one_sentence(missing, "cannot read the plant in ", "nowhere.json: No such file or directory")
-    wrong = ncs(*command, "--plant", "certificate.json", cwd=tmp_path)
+    wrong = ncs("verify", "certificate.json", "--plant", "certificate.json", cwd=tmp_path)
     assert_one_sentence(wrong, "certificate.json is not a plant of format")

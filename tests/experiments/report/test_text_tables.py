@@ -1,14 +1,12 @@
 """What the tables of results print, and no negative zero."""
 
 import re
-from collections import Counter
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
 import pytest
 
-from experiments.commands.attack import table_of
 from experiments.commands.compare import findings_of
 from experiments.report.html import comparison_report
 from experiments.report.text_tables import summary_text, sweep_table
@@ -78,23 +76,6 @@ def test_sweep_says_where_the_proof_did_not_hold():
     for each in many:
         each["arms"]["shielded"] |= {"guaranteed_episodes": 0, "eval_episodes": 4}
     assert " ".join(sweep_table(many).split()).endswith("shielded at loss 0.6, delay 2 (0 of 4) and 3 others.")
-
-
-def test_heads_have_at_most_two_lines_of_whole_words():
-    summary = comparison()
-    tables = [
-        *summary_text(summary["arms"], {}).split("\n\n"),
-        sweep_table([cell()]),
-        table_of({"a": Counter(steps=1)}),
-    ]
-    for table in tables:
-        head = table.partition("\n---")[0].rpartition("\n\n")[2].splitlines()
-        assert len(head) == 2
-        assert [word for line in head for word in line.split() if word.endswith("-")] == []
-    page = comparison_report(summary, Report((flag("(S)", True),)), {}, [])
-    heads = re.findall(r"<th [^>]*>(.*?)</th>", page, flags=re.DOTALL)
-    assert "violating\nepisodes" in heads
-    assert [head for head in heads if head.count("\n") > 1 or "<" in head] == []
 
 
 def test_training_has_a_table_only_where_something_was_trained():

@@ -5,7 +5,8 @@ import pytest
 from agents.hyperparams import DEFAULTS, with_changes
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from benchmarks.suite import NETWORK_TASKS
-from experiments.baselines import EstimateFilter, tuned_training
+from experiments.baselines.filters import EstimateFilter
+from experiments.baselines.tuned import tuned_training
 from experiments.commands.compare import CompareSettings
 from experiments.runs.arms import Arm, is_shield, run_of_arm
 from experiments.runs.loops import certificate_of
@@ -33,21 +34,16 @@ def layers(env):
         ("unshielded", None, "trained"),
         ("lagrangian", None, "trained"),
         ("shielded:switch", "switch", "trained"),
-        ("trusting", "trusting", "trained"),
         ("psf+penalty", "psf", "trained"),
         ("lookahead", "lookahead", "trained"),
-        ("lookahead at test", "lookahead", "trained"),
         ("SAC lookahead at test", "lookahead", "trained"),
         ("mpc:20+psf:tube", "psf:tube", "mpc:20"),
         ("shield at test", "boundary", "trained"),
-        ("trusting at test", "trusting", "trained"),
         ("shielded+penalty", "boundary", "trained"),
         ("zero input", None, "zero input"),
         ("K x_hat+shielded", "boundary", "K x_hat"),
-        ("lqr+psf", "psf", "lqr"),
         ("random+shielded:project", "project", "random"),
         ("untrained+trusting", "trusting", "untrained"),
-        ("mpc:50", None, "mpc:50"),
     ],
 )
 def test_name_says_which_filter_and_which_policy(name, mode, policy):

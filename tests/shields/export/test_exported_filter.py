@@ -263,7 +263,7 @@ def test_the_command_says_what_the_board_needs(tmp_path, monkeypatch):
     plant.save(tmp_path / "plant.json")
     certificate.save(tmp_path / "certificate.json")
     files = tmp_path / "certificate.json", "--plant", tmp_path / "plant.json"
-    said = succeeded("export-c", *files, "--out", tmp_path / "c")
+    said = succeeded("verify", *files, "--c", tmp_path / "c")
     assert "1,720 bytes of numbers and 120 bytes of state" in said.prose
     assert "at most 6 steps old" in said.prose
     text = (tmp_path / "c" / "vectors.txt").read_text()
@@ -287,8 +287,8 @@ def test_what_is_not_exported_is_refused_in_a_sentence(file, plant, words, tmp_p
     from shields.packaged_certificates import __file__ as package
 
     certificate = package.replace("__init__.py", f"{file}-v0.json")
-    said = ncs("export-c", certificate, "--plant", f"ncs_gym/{plant}-v0", "--out", tmp_path / "c")
-    assert (said.returncode, said.stdout, said.stderr.count("\n")) == (2, "", 1)
+    said = ncs("verify", certificate, "--env", f"ncs_gym/{plant}-v0", "--c", tmp_path / "c")
+    assert (said.returncode, said.stderr.count("\n")) == (2, 1)
     assert words in said.stderr
     assert not (tmp_path / "c").exists()
 

@@ -1,9 +1,11 @@
-"""`ncs reproduce`: simulates Section 5 of Liu et al. with the printed design, a certified one, and OP's."""
+"""`ncs paper`: checks the claims of Liu et al., or simulates their Section 5; docs/paper.md discusses both."""
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,41 +13,99 @@ import gymnasium as gym
 import matplotlib
 import numpy as np
 
+from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
 from experiments.plots.figure_style import STYLE, CaptionedFigure
-from experiments.runs.output_folder import claim_folder, write_results
+from experiments.runs.output_folder import claim_folder, write_json, write_results
 from experiments.settings import require_limits
-from experiments.terminal import text_table
+from experiments.terminal import text_table, wrapped
 from ncs_gym import BoxDisturbance, Ellipsoid, LinearPlant
 from ncs_gym.registration import CASE_STUDY_BOX
-from shields import paper, synthesize
+from shields import paper as published
+from shields import synthesize
 from shields.paper.bounds import with_noise
 from shields.paper.feasibility import FeasibilityScan, largest_scale
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReproduceSettings:
-    """Simulates Section 5 of Liu et al. with three designs: printed, certified, and OP's.
+class PaperSettings:
+    """Checks the claims of the paper (Liu et al.) from its own printed numbers, or simulates its Section 5.
 
-    OP's is at the nearest feasible bounds. Random initial states in each safe set meet all four network impairments.
-    Prints a table and leaves a figure and summary.json.
+    Simulated are the printed design, a certified one, and that of the problem OP at the nearest feasible bounds, from
+    random states in each safe set, under all four network impairments.
 
     Attributes:
-        out: Output folder.
-        starts: Number of random initial states per design.
+        simulate: Simulate in place of checking claims.
+        starts: Initial states per design.
         steps: Steps of each simulation.
-        force: Replace finished results of other settings in the output folder, which otherwise is refused.
         seed: Seed of initial states, disturbances and channel, the same for all designs.
+        out: Output folder for claims.json, or for summary.json and a figure of the simulation.
+        force: Replace results of other settings in the output folder.
     """
 
-    out: Path = Path("runs/reproduce")
+    simulate: bool = False
     starts: int = 100
     steps: int = 200
-    force: bool = False
     seed: int = 0
+    out: Path | None = None
+    force: bool = False
 
     def __post_init__(self) -> None:
         require_limits(self, starts=1, steps=1, seed=0)
+
+
+def paper(settings: PaperSettings) -> None:
+    """Runs `ncs paper`."""
+    if settings.out is not None:
+        claim_folder("paper", settings)
+    if not settings.simulate:
+        claims = list(audited_claims(PaperExample()))
+        print(text_of(claims))
+        if settings.out is not None:
+            write_json(settings.out / "claims.json", [asdict(claim) for claim in claims])
+        return
+    chosen = designs()
+    played = [simulated(design, settings) for design in chosen]
+    outcomes = {design.name: outcome(design, *found) for design, found in zip(chosen, played, strict=True)}
+    cells = [[name, *(text.format(**each) for each in outcomes.values())] for name, text in _ROWS]
+    claimed = ["claimed epsilon", *("-" if each.epsilon is None else f"{each.epsilon:.5f}" for each in chosen)]
+    print(text_table([["", *outcomes], *cells, claimed]))
+    if settings.out is not None:
+        figure = states_figure(chosen, [states for states, *_ in played])
+        write_results(settings.out, outcomes, figures={"states": (figure.caption, figure.png)})
+        print(f"files: {settings.out}")
+
+
+_RELATIONS = re.compile(r" (=|<=|>=|<|>) ")
+
+
+def text_of(claims: Sequence[Claim]) -> str:
+    """Returns the claims as a terminal shows them, and a summary."""
+    blocks = []
+    for number, claim in enumerate(claims, 1):
+        lines = [_wrapped(f"{number:2d}.", f"{claim.verdict.upper()}: {claim.claim}", 4)]
+        for label, text in (("printed", claim.printed), ("computed", claim.computed), ("charitably", claim.charitable)):
+            lines += [_wrapped(f"    {label}", text, 16)] * bool(text)
+        blocks.append("\n".join(lines))
+    counts, found = Counter(claim.verdict for claim in claims), defects(claims)
+    text = (
+        f"Of {len(claims)} rows {counts[Verdict.HOLDS] + counts[Verdict.ROUNDED]} hold ({counts[Verdict.ROUNDED]} of "
+        f"them but for rounding), {counts[Verdict.FAILS]} do not hold, {counts[Verdict.UNDECIDED]} are undecided, "
+        f"{counts[Verdict.NOT_PRINTED]} is about what is not printed, {counts[Verdict.VACUOUS]} is vacuous. The rows "
+        f"that do not hold show {len(found)} distinct defects:"
+    )
+    lines = [_wrapped("", text, 0)]
+    for number, (defect, rows) in enumerate(found.items(), 1):
+        named = f"row{'s' * (len(rows) > 1)} {', '.join(map(str, rows))}"
+        lines.append(_wrapped(f"{number:2d}.", f"{defect} ({named})", 4))
+    return "\n\n".join([*blocks, "\n".join(lines)])
+
+
+def _wrapped(label: str, text: str, indent: int) -> str:
+    """Returns a label and a text in lines of the terminal's width; a formula is not broken at its relation."""
+    for product in ("K L K'", "x+'M x+"):
+        text = text.replace(product, product.replace(" ", "\0"))
+    return wrapped(_RELATIONS.sub("\0\\1\0", text), label=label, indent=indent).replace("\0", " ")
 
 
 # OP is solved at this fraction of the largest feasible scale of the bounds, on a fine grid of kappa and rho.
@@ -73,22 +133,6 @@ class StateFeedback(NamedTuple):
     epsilon: float | None  # claimed bound on e'e, e = B K e_up
 
 
-def reproduce(settings: ReproduceSettings) -> None:
-    """Runs `ncs reproduce`."""
-    claim_folder("reproduce", settings)
-    outcomes, paths = {}, []
-    for design in (chosen := designs()):
-        states, inputs, errors = simulated(design, settings)
-        outcomes[design.name] = outcome(design, states, inputs, errors)
-        paths.append(states)
-    figure = states_figure(chosen, paths)
-    write_results(settings.out, outcomes, figures={"states": (figure.caption, figure.png)})
-    cells = [[name, *(text.format(**each) for each in outcomes.values())] for name, text in _ROWS]
-    claims = ["claimed epsilon", *("-" if each.epsilon is None else f"{each.epsilon:.5f}" for each in chosen)]
-    print(text_table([["", *outcomes], *cells, claims]))
-    print(f"files: {settings.out}")
-
-
 def designs() -> list[StateFeedback]:
     """Returns the three designs: printed, certified, and OP's."""
     example = PaperExample()
@@ -97,7 +141,7 @@ def designs() -> list[StateFeedback]:
     scale = _OP_SCALE * largest_scale(FeasibilityScan(plant), plant)
     Q, P0 = scale * plant.process_noise_cov, scale * plant.initial_cov
     scaled = with_noise(plant, gamma=scale * plant.gamma, Q=Q, P0=P0)
-    op = paper.synthesize(scaled, dkappa=_OP_GRID_STEP, drho=_OP_GRID_STEP)
+    op = published.synthesize(scaled, dkappa=_OP_GRID_STEP, drho=_OP_GRID_STEP)
     box = BoxDisturbance((1.0 - 1e-9) * scale**0.5 * np.asarray(CASE_STUDY_BOX.half_widths))
     return [
         StateFeedback("printed", plant, CASE_STUDY_BOX, example.L, example.K, example.epsilon),
@@ -106,7 +150,7 @@ def designs() -> list[StateFeedback]:
     ]
 
 
-def simulated(design: StateFeedback, settings: ReproduceSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def simulated(design: StateFeedback, settings: PaperSettings) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns true states (steps + 1, starts, 2), inputs K x_hat and estimation errors, (steps, starts, 1 or 2)."""
     envs = gym.make_vec(
         "ncs_gym/TruckTrailer-v0",
@@ -129,7 +173,7 @@ def simulated(design: StateFeedback, settings: ReproduceSettings) -> tuple[np.nd
 def outcome(
     design: StateFeedback, states: np.ndarray, inputs: np.ndarray, errors: np.ndarray
 ) -> dict[str, float | None]:
-    """Returns counts of steps and largest values, by name; e = B K e_up, and `epsilon` is the design's own claim."""
+    """Returns counts of steps and largest values of what `simulated` returned, by name."""
     levels = np.einsum("ksi,ij,ksj->ks", states, np.linalg.inv(design.L), states)
     boxes = np.abs(states @ design.plant.box_rows.T).max(axis=2)
     gain = design.plant.B @ design.K
