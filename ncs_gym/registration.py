@@ -128,16 +128,10 @@ class Factory:
         for name, value in given.items():
             if name in kinds or name == "terminate_on_violation":
                 if value is not None:
-                    own[name] = self._object(value, kinds[name], name) if name in kinds else value
+                    own[name] = from_json(value, kinds[name], name) if name in kinds else value
             else:
                 own[name] = value
         return own
-
-    def _object(self, value: Any, kinds: tuple[type, ...], name: str) -> Any:
-        """Returns what a JSON value stands for; of many environments, each may have a channel of its own."""
-        if self.is_vector and kinds == (Channel,) and isinstance(value, (list, tuple)):
-            return [from_json(each, kinds, name) for each in value]
-        return from_json(value, kinds, name)
 
     @property
     def metadata(self) -> dict[str, Any]:

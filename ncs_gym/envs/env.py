@@ -336,8 +336,8 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         return self._observer.observation(self._belief, self._task.observe(task_state))
 
 
-def note_of(guard: Any, info: dict[str, Any], loop: int = 0) -> Annotation | None:
-    """Returns what the picture of the last step shows of a guard, given the info of a loop; None without a guard."""
+def note_of(guard: Any, info: dict[str, Any]) -> Annotation | None:
+    """Returns what the picture of the last step shows of a guard, given its info; None without a guard."""
     if guard is None:
         return None
     judge = guard.filter
@@ -348,7 +348,7 @@ def note_of(guard: Any, info: dict[str, Any], loop: int = 0) -> Annotation | Non
         intervened=bool(info["shield_intervened"]),
         interventions=int(info["episode_interventions"]),
         protects=judge.mode != "monitor",
-        plan=guard.plan(loop) if judge.mode == "lookahead" else None,
+        plan=guard.plan() if judge.mode == "lookahead" else None,
     )
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ncs_gym.envs.episode_channels import EpisodeChannels
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.loop import Loop, LoopState
 from ncs_gym.envs.report import Belief
@@ -60,6 +61,11 @@ class GuardedLoop:
         if self._guard is not None:
             raise ValueError("the environment has a shield already: leave one out, or make an environment for each")
         self._guard, self._consistent = guard, False
+
+    @property
+    def links(self) -> dict[tuple[str, None], EpisodeChannels]:
+        """The channels of the present episodes, by the name of their option of `reset`."""
+        return self._now.links
 
     @property
     def state(self) -> np.ndarray:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, fields, replace
+from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
-from math import inf, isclose
+from math import isclose
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -190,20 +189,6 @@ class Channel:
         return np.rint(measurement / q) * q if q > 0.0 else measurement
 
 
-def widest(channels: Sequence[Channel]) -> Channel:
-    """Returns the channel whose samples become the oldest, with the coarsest quantization step of all.
-
-    One that promises nothing is wider than any that does; among equals it is the one with the longest delay.
-    """
-
-    def oldest(channel: Channel) -> tuple[float, int]:
-        age = channel.oldest_age
-        return inf if age is None else age, channel.longest_delay
-
-    coarsest = max(channel.quantization_step for channel in channels)
-    return replace(max(channels, key=oldest), quantization_step=coarsest)
-
-
 def _chain(bursts: GilbertElliott, period: int) -> np.ndarray:
     """Returns the transition matrix of bursts from one packet to the next, shape (2, 2)."""
     good, bad = bursts.p_good_to_bad, bursts.p_bad_to_good
@@ -341,19 +326,8 @@ class TraceChannel(Channel):
         """
         if self.on_request or self.max_consecutive_losses is None:
             return super().oldest_age
-        return int(self._replay().max())
-
-    @property
-    def usual_age(self) -> int:
-        """An age that the newest sample exceeds in at most `UNUSUAL` of the steps of a replay [steps]."""
-        if self.on_request or self.oldest_age is None:
-            return super().usual_age
-        return int(np.quantile(self._replay(), 1.0 - UNUSUAL, method="higher"))
-
-    def _replay(self) -> np.ndarray:
-        """Returns the ages of the newest sample of a replay that goes around twice, shape (steps,) [steps]."""
-        around = len(self.trace) * self.send_period
-        return replayed_ages(self.delays, self.send_period, 2 * around + self.longest_delay)
+        twice = 2 * len(self.trace) * self.send_period + self.longest_delay
+        return int(replayed_ages(self.delays, self.send_period, twice).max())
 
     @property
     def description(self) -> str:

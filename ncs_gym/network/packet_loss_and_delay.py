@@ -215,7 +215,7 @@ class VectorChannelState:
 
     def __init__(self, channel: Channel | Sequence[Channel], rng: np.random.Generator, size: int) -> None:
         self.channel = channel if isinstance(channel, Channel) else side_by_side(channel)
-        self._size, self._sends = size, np.zeros(size, np.bool_)
+        self._size = size
         self._all = frozen(np.ones(size, np.bool_))  # which send where each step has a sample
         self._loss_state = first_loss_state(self.channel, rng, size)
         # For the samples of each age, after how many steps they arrive.
@@ -253,13 +253,8 @@ class VectorChannelState:
         if sends is None:
             sends = self._all if isinstance(period, int) and period == 1 else steps % period == 0
         self._loss_state, delays = transmit(self.channel, rng, self._loss_state, sends)
-        self._delays, self._sends = [delays, *self._delays[:-1]], sends
+        self._delays = [delays, *self._delays[:-1]]
         return sends
-
-    def arrival_of(self, e: int, step: int) -> tuple[bool, int | None]:
-        """Returns whether environment e sent at its present step, and at which step that arrives; None if never."""
-        sends, delay = bool(self._sends[e]), int(self._delays[0][e])
-        return sends, step + delay if sends and delay >= 0 else None
 
     def discard(self, chosen: Any) -> None:
         """Loses the samples that were just sent by some environments."""

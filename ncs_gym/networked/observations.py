@@ -96,13 +96,6 @@ def has_floats(space: spaces.Space) -> bool:
     return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
 
 
-def is_batched(space: spaces.Space) -> bool:
-    """Returns whether vector environments hold observations of many environments as arrays with a first axis more."""
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        return all(map(is_batched, space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces))
-    return isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary)
-
-
 def zero_of(space: spaces.Space) -> Any:
     """Returns the zero of a space.
 

@@ -201,7 +201,7 @@ class OneGuard(Guard):
             "episode_guaranteed": self._proved / self._count,
         }
 
-    def plan(self, loop: int = 0) -> np.ndarray:
+    def plan(self) -> np.ndarray:
         """Returns the inputs stored for the steps to come, shape (k, m)."""
         return self._stored.copy()
 
@@ -313,11 +313,6 @@ class ManyGuards(Guard):
             "episode_interventions": self._interventions.copy(),
             "episode_guaranteed": self._proved / self._count,
         }
-
-    def plan(self, loop: int = 0) -> np.ndarray:
-        """Returns the inputs stored for the steps to come of a loop, shape (k, m)."""
-        plan = self._stored[..., loop]
-        return plan[~np.isnan(plan[:, 0])] if len(plan) else plan.copy()
 
     def _leave(self, strayed: np.ndarray) -> None:
         """Ends the proof of loops that moved without this guard."""

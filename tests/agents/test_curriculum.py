@@ -65,8 +65,6 @@ def test_what_is_drawn_from_changes_for_episodes_that_begin_by_themselves_and_in
             assert env.reset_infos[1]["channel_loss"] == 0.5
             np.testing.assert_allclose(observation[1][:2], env.reset_infos[1]["estimate"], rtol=1e-6)
     assert seen == [0.1] * 4 + [0.5] * 9
-    with pytest.raises(ValueError, match="takes the place of what was given: give channel"):
-        draws.draw_from(downlink=[Channel()])
     with pytest.raises(AttributeError, match=r"use vec_env\.vector_env"):
         env.env_method("draw_from", [Channel()])
 
