@@ -147,7 +147,7 @@ def test_whatever_stands_around_a_guard_its_proof_is_right(certificate, loaded, 
     env.reset(seed=seed, options=None if start is None else {"state": start})
     for _ in range(25):
         _, _, terminated, truncated, _ = env.step(rng.uniform(0.0, 1.5, 1).astype(np.float32))
-        if not bare.guard.reason:
+        if not bare.guard.code:
             claims += 1
             assert certificate.safe_set.gauge(bare.state) <= 1.0
         if terminated or truncated:

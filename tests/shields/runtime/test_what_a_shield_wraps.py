@@ -107,7 +107,7 @@ def test_no_wrapper_inside_the_shield_breaks_its_promise(name, mode):
             env.step(action)
             belief = env.unwrapped.belief
             assert np.abs(PLANT.box_rows @ env.unwrapped.state).max() <= 1.0
-            assert env.unwrapped.guard.reason == ""
+            assert env.unwrapped.guard.code == 0
             assert belief.applied.flags.writeable is False
             broken += bare.step(action)[4]["cost"]
     assert broken > 0
