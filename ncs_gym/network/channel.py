@@ -25,8 +25,7 @@ class Packet(NamedTuple):
     Attributes:
         stamp: Step at which the sample was taken, counted from the start of its episode.
         measurement: The (quantized) measurement, shape (p,).
-        episode: Number of that episode, counted from 0: stamps begin anew in each, so that an estimator discards
-            packets of any episode but its own (`Estimator.episode`).
+        episode: Number of that episode, counted from 0; an estimator discards packets of any but its own.
     """
 
     stamp: int
@@ -198,8 +197,8 @@ def _chain(bursts: GilbertElliott, period: int) -> np.ndarray:
 def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
     """Returns the long-run share of packets that are lost, of one every so many steps and at most `most` in a row.
 
-    It is that of a cycle from one arrival to the next. With M the chain from one packet to the next and N its part with
-    a loss, a cycle that begins in the states a has on average a (1 + N + .. + N^most) 1 packets, one of which arrives.
+    With M the chain from one packet to the next and N its part with a loss, a cycle from one arrival to the next that
+    begins in the states a has on average a (1 + N + .. + N^most) 1 packets, one of which arrives.
     """
     M = _chain(bursts, period)
     N = M * [bursts.loss_good, bursts.loss_bad]
@@ -213,11 +212,7 @@ def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
 
 
 def require_on_request(requests: Any) -> Any:
-    """Returns the requests of a channel that takes samples on request.
-
-    Raises:
-        ValueError: If there are none: then samples are sent periodically.
-    """
+    """Returns the requests of a channel that takes samples on request; raises ValueError if there are none."""
     if requests is None:
         raise ValueError("the channel sends samples by itself: make it with Channel(..., on_request=True)")
     return requests
@@ -240,7 +235,6 @@ def in_time(seconds: float) -> str:
 
 
 def _bursts(loss: dict[str, Any]) -> GilbertElliott:
-    """Returns the bursty loss whose fields a dictionary holds, as `dataclasses.asdict` leaves one."""
     try:
         return GilbertElliott(**loss)
     except TypeError:
@@ -255,9 +249,9 @@ class TraceChannel(Channel):
     """A channel that replays what happened to the samples of a record, from a random one on and around again.
 
     `PacketLog.channel` makes one of recorded packets. Every `send_period` steps the next entry of the trace is what
-    happens to the sample of that step; an entry where nothing was sent is that of a lost packet. The contract of the
-    channel is the largest age of the replay (`oldest_age`). On request (`on_request`) the next entry is that of the
-    next sample that is asked for, so that an outage does not end before as many samples are lost as in the record.
+    happens to the sample of that step; where nothing was sent it is lost. The contract of the channel is the largest
+    age of the replay (`oldest_age`). On request (`on_request`) the next entry is that of the next sample that is asked
+    for, so that an outage does not end before as many samples are lost as in the record.
 
     Attributes:
         trace: After how many steps each sample arrived, one after the other; -1 for one that was lost, or never sent.
@@ -322,7 +316,7 @@ class TraceChannel(Channel):
     def oldest_age(self) -> int | None:
         """The largest age of the newest sample in a replay without end [steps]; None if nothing arrives.
 
-        On request the limit is that of the longest run of losses and the longest delay, as of every channel.
+        On request the limit is that of the longest run of losses and the longest delay.
         """
         if self.on_request or self.max_consecutive_losses is None:
             return super().oldest_age
@@ -340,8 +334,7 @@ class TraceChannel(Channel):
 def replayed_ages(trace: np.ndarray, send_period: int, steps: int) -> np.ndarray:
     """Returns the age of the newest sample that has arrived at every step of a replay, shape (steps,) [steps].
 
-    The replay begins with the first sample of the trace at step 0, where the first estimate counts as a sample, and
-    begins anew when the trace is over.
+    The replay begins with the first sample of the trace at step 0, where the first estimate counts as a sample.
 
     Args:
         trace: After how many steps each sample arrives, -1 for a lost one, shape (k,).

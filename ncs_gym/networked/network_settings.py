@@ -37,18 +37,13 @@ class NetworkSettings:
     Args:
         observations: Space of the observations of one environment.
         actions: Space of its actions.
-        settings: The keywords of `Networked` by name.
+        settings: The keywords of `Networked` by name, as which they are kept where they are checked alone.
 
     Attributes:
         parts: The parts of observations that have a channel of their own.
         keys: Their keys; None for the whole observation.
         channels: Their channels.
         channel: The only one of them, or a dictionary of them by the keys of their parts.
-        downlink: The network of the actions; None for an ideal one.
-        fill: "last", "zero" or a predictor.
-        idle: "hold" or "neutral".
-        neutral: The action before the first command arrives; None where all arrive at once.
-        pending: How many of the last actions are kept.
         entries: What is added to observations.
         recorded: The settings as JSON values, as far as they can be.
 
@@ -175,11 +170,7 @@ def network_rng(seed: Any) -> np.random.Generator:
 
 
 def as_channel(value: Any, name: str) -> Channel | None:
-    """Returns a channel, also one whose fields a dictionary holds; None for None.
-
-    Raises:
-        ValueError: If it is neither.
-    """
+    """Returns a channel, also one whose fields a dictionary holds, None for None; raises ValueError for others."""
     channel = from_json(value, (Channel,), name)
     if channel is None or isinstance(channel, Channel):
         return channel
@@ -206,7 +197,6 @@ def _neutral(given: Any, actions: spaces.Space, needed: bool) -> Any:
 
 
 def _has_choices(actions: spaces.Space) -> bool:
-    """Returns whether some part of actions is a number of a list, whose zero is an action like any other."""
     if isinstance(actions, spaces.Dict | spaces.Tuple):
         inner = actions.spaces.values() if isinstance(actions, spaces.Dict) else actions.spaces
         return any(map(_has_choices, inner))

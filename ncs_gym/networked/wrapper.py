@@ -257,14 +257,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
 
 
 class _Arrivals:
-    """What has arrived of a part of the observations.
-
-    Attributes:
-        link: Its channel.
-        stamp: Step at which the newest sample was taken.
-        sample: That sample.
-        arrived: Whether it arrived at this step.
-    """
+    """What has arrived of a part of the observations: the newest sample, its step, and whether it arrived now."""
 
     link: ChannelState
 
