@@ -162,9 +162,7 @@ class LoopState(CopiedWhole, ABC):
     def move(self, rng: np.random.Generator, u: np.ndarray) -> tuple[Inputs, Any]:
         """Moves one step on; returns the inputs of the step, and whether a packet arrived, a bool or shape (N,).
 
-        Args:
-            rng: Source of randomness.
-            u: What is decided now, shape (m,) or (m, N) [physical units].
+        What is decided now is `u`, shape (m,) or (m, N) [physical units].
         """
         self.moves = self.moves + 1
         inputs = self.downlink.exchange(rng, self.steps, u)
@@ -253,13 +251,7 @@ class OneLoop(LoopState):
         self.received: list[Any] = []
 
     def begin(self, rng: np.random.Generator, start: np.ndarray | None, fixed: np.ndarray | None) -> None:
-        """Begins an episode.
-
-        Args:
-            rng: Source of randomness.
-            start: Where, shape (n,); None draws it from the initial set.
-            fixed: What `read` returned of parameters.
-        """
+        """Begins an episode at a state, (n,), or a drawn one; `fixed` is what `read` returned of parameters."""
         loop, self.moves = self.loop, self.moves + 1
         initial = loop.initial_set if start is None else None
         first = (1.0 - SAMPLE_ROUNDING) * loop.initial_set.sample(rng) if start is None else start
@@ -309,14 +301,7 @@ class ManyLoops(LoopState):
     def begin(
         self, rng: np.random.Generator, mask: np.ndarray, starts: np.ndarray | None, fixed: np.ndarray | None
     ) -> None:
-        """Begins episodes where `mask`, shape (N,), says so.
-
-        Args:
-            rng: Source of randomness.
-            mask: Where.
-            starts: The states, shape (N, n); None draws them from the initial set.
-            fixed: What `read` returned of parameters.
-        """
+        """Begins episodes where a mask, (N,), says so, at states, (N, n), or drawn ones; for `fixed` see `read`."""
         loop, rows, self.moves = self.loop, np.flatnonzero(mask), self.moves + mask
         count = len(rows)
         first_states = ((1.0 - SAMPLE_ROUNDING) * loop.initial_set.sample(rng, count)).T

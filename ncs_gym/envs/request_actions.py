@@ -43,8 +43,7 @@ class RequestActions(_WithCost, gym.Wrapper, RecordConstructorArgs):
     The action has one entry more, in [-1, 1]: a sample is asked for where it is positive. The observation has two
     entries more: the age of the newest sample used, and how many samples are requested that are newer than it
     (`NCSEnv.outstanding`) [steps, samples], both clipped to what the contract allows. From the reward the cost of every
-    packet sent is subtracted, also of those that the contract forces. Wrap it around the shield, whose actions stay as
-    they are.
+    packet sent is subtracted, also of those that the contract forces. Wrap it around the shield.
 
     Args:
         env: An `NCSEnv` whose channel takes samples on request, or another environment in such a `Networked`, possibly
@@ -73,11 +72,7 @@ class RequestActions(_WithCost, gym.Wrapper, RecordConstructorArgs):
         return self._seen(observation), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Asks for a sample if the last entry of the action is positive, and applies the others.
-
-        Raises:
-            ValueError: If the action is not finite or wrongly shaped; nothing has moved then.
-        """
+        """Asks for a sample if the last entry of the action is positive, and applies the others."""
         inputs, asked = _parted(action, self.action_space)
         self._inner.request(bool(asked))
         observation, reward, terminated, truncated, info = self.env.step(inputs)
@@ -128,11 +123,7 @@ class VectorRequestActions(_WithCost, AroundEnvironments, VectorWrapper, RecordC
         return self._seen(observations), info
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Asks for samples where the last entries of the actions, (N, m+1), are positive, and applies the others.
-
-        Raises:
-            ValueError: If an action is not finite or the shape is wrong; nothing has moved then.
-        """
+        """Asks for samples where the last entries of the actions, (N, m+1), are positive, and applies the others."""
         inputs, asked = _parted(actions, self.action_space)
         self._inner.request(asked)
         observations, rewards, terminated, truncated, info = self.env.step(inputs)

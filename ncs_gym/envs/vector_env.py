@@ -182,10 +182,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         return self._observation(), reward, terminated, truncated, info
 
     def _begin(self, mask: np.ndarray, starts: np.ndarray | None = None, fixed: np.ndarray | None = None) -> Begun:
-        """Begins episodes where `mask` (N,) says so, at `starts` (N, n) or drawn from the initial set.
-
-        `fixed` is what the process read of the parameters of a family, (N, k).
-        """
+        """Begins episodes; see `ManyLoops.begin`."""
         now = self._now
         now.begin(self.np_random, mask, starts, fixed)
         begun = self._task.begin_many(self._task_random, self.plant, int(np.count_nonzero(mask)))
