@@ -1,10 +1,6 @@
 """The vector environment equals the scalar one, fed with the same draws; shared graphs and copies change nothing."""
 
-import copy
 import gc
-import pickle
-import sys
-import threading
 import tracemalloc
 import weakref
 
@@ -178,45 +174,6 @@ def test_environments_that_share_a_graph_do_not_notice_each_other(kind, most, mo
         env.reset(seed=seed)
     runs = zip(*(steps_of(env, 120, seed) for seed, env in enumerate(envs)), strict=True)
     assert_equal([run[0] for run in runs], wanted)
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_copy_made_in_the_middle_of_an_episode_goes_on_like_the_original(kind, copied):
-    env = KINDS[kind]()
-    env.reset(seed=0)
-    list(steps_of(env, 29))
-    twin = copied(env)
-    wanted = list(steps_of(env, 60, seed=1))
-    assert_equal(steps_of(twin, 60, seed=1), wanted)
-
-
-@pytest.mark.parametrize("most", [pytest.param(1 << 17, marks=pytest.mark.slow), 300])
-def test_threads_share_a_graph(most, monkeypatch):
-    settings = {"plant": truck_trailer(), "channel": Channel(loss=0.3, jitter=3, delay=1)}
-
-    def run(seed, returned):
-        env = vector_env(8, **settings)
-        env.reset(seed=seed)
-        returned[seed] = list(steps_of(env, 100))
-
-    alone, together = {}, {}
-    for seed in range(4):
-        run(seed, alone)
-    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", most)
-    interval = sys.getswitchinterval()
-    try:
-        sys.setswitchinterval(1e-6)
-        monkeypatch.setattr(arrival_histories, "_shared", {})
-        threads = [threading.Thread(target=run, args=(seed, together)) for seed in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    finally:
-        sys.setswitchinterval(interval)
-    for seed in range(4):
-        assert_equal(together[seed], alone[seed])
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 from tests.product import altered, safety_filter
-from tests.shields.attacks.cases import RANDOM
 from tests.shields.edges import edge_of
 from tests.shields.runtime.batches import decided_alike
 
@@ -334,22 +333,3 @@ def test_indefinite_error_shapes_of_three_states_are_unusable():
     skew = 1e-4 * np.eye(3) + np.array([[0.0, 1e-5, 0.0], [-1e-5, 0.0, 0.0], [0.0, 0.0, 0.0]])
     u = np.zeros(2)
     assert shield.margin(u[[0, 0, 0]], skew, u) == pytest.approx(shield.margin(u[[0, 0, 0]], skew.T, u), abs=1e-15)
-
-
-def test_boundary_trusts_weak_inputs_of_larger_plants_too():
-    plant = RANDOM["n=3 m=2 p=1"]
-    certificate = certificate_of(plant)
-    boundary, rng = safety_filter(certificate, plant, "boundary"), np.random.default_rng(0)
-    reasons = set()
-    for _ in range(200):
-        estimate = certificate.safe_set.sample(rng)
-        reasons.add(boundary.decide(estimate, 0.1 * certificate.Sigma, rng.uniform(-0.3, 0.3, 2)).reason)
-    assert reasons == {"safe", "fallback"}
-
-
-def test_empty_batches_give_empty_decisions(case):
-    plant, certificate = case
-    none = safety_filter(certificate, plant).decide_many(
-        np.zeros((0, plant.n)), certificate.Sigma, np.zeros((0, plant.m))
-    )
-    assert (none.input.shape, none.reason.shape, none.margin.shape) == ((0, plant.m), (0,), (0,))
