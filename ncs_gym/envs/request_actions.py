@@ -6,19 +6,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.vector_env import NCSVectorEnv
-from ncs_gym.validation import (
-    AroundEnvironments,
-    as_number,
-    as_numbers,
-    require_batched_infos,
-    shown,
-)
+from ncs_gym.validation import AroundEnvironments, as_number, as_numbers, require_batched_infos, shown
 
 
 class _WithCost:
@@ -46,9 +41,8 @@ class RequestActions(_WithCost, gym.Wrapper, RecordConstructorArgs):
     packet sent is subtracted, also of those that the contract forces. Wrap it around the shield.
 
     Args:
-        env: An `NCSEnv` whose channel takes samples on request, or another environment in such a `Networked`, possibly
-            wrapped; observations are a vector of numbers; actions are one too, or a number from 0 on (`Discrete`),
-            which becomes a pair.
+        env: An `NCSEnv` whose channel takes samples on request, possibly wrapped; actions and observations are vectors
+            of numbers.
         cost: Of a packet, in units of the reward, >= 0.
 
     Raises:
@@ -59,7 +53,7 @@ class RequestActions(_WithCost, gym.Wrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
         self.cost = cost
-        self._inner = _on_request(env)
+        self._inner = _on_request(env, NCSEnv)
         self._most = self._inner.request_limits
         self.action_space = _with_request(env.action_space)
         self.observation_space = _with_age(env.observation_space, self._most)
@@ -100,9 +94,7 @@ class VectorRequestActions(_WithCost, AroundEnvironments, VectorWrapper, RecordC
         RecordConstructorArgs.__init__(self)
         VectorWrapper.__init__(self, env)
         self.cost = cost
-        self._inner = _on_request(env)
-        if not isinstance(self._inner, NCSVectorEnv):
-            raise ValueError(f"expected an NCSVectorEnv inside, got {type(self._inner).__name__}")
+        self._inner = _on_request(env, NCSVectorEnv)
         if self._inner.autoreset_mode is AutoresetMode.SAME_STEP:
             raise ValueError("with SAME_STEP autoreset the age at an episode's end is not known: use NEXT_STEP")
         self._most = self._inner.single.request_limits
@@ -136,23 +128,19 @@ class VectorRequestActions(_WithCost, AroundEnvironments, VectorWrapper, RecordC
         return np.concatenate([observations, more], axis=1).astype(self.observation_space.dtype)
 
 
-def _on_request(env: Any) -> Any:
-    """Returns the layer that takes requests: the environment inside all wrappers, or the network around it."""
-    layer = env
-    while not hasattr(type(layer), "request") and layer is not env.unwrapped:
-        layer = layer.env
-    if not hasattr(type(layer), "request"):
-        raise ValueError(f"expected an NCSEnv inside, or Networked around another one, got {type(layer).__name__}")
-    layer.request(False)  # raises where samples are sent by themselves
-    return layer
+def _on_request(env: Any, kind: type) -> Any:
+    """Returns the environment inside all wrappers, which takes requests."""
+    inner = env.unwrapped
+    if not isinstance(inner, kind):
+        raise ValueError(f"expected an {kind.__name__} inside, got {type(inner).__name__}")
+    inner.request(False)  # raises where samples are sent by themselves
+    return inner
 
 
 def _with_request(actions: Any) -> Any:
     """Returns actions with one entry more, which asks for a sample."""
-    if isinstance(actions, Discrete) and actions.start == 0:
-        return MultiDiscrete([actions.n, 2])
     if not (isinstance(actions, Box) and len(actions.shape) == 1):
-        raise ValueError(f"a request is one entry more of a vector of numbers or a number from 0 on, got {actions}")
+        raise ValueError(f"a request is one entry more of a vector of numbers, got {actions}")
     return _wider(actions, [-1.0], [1.0])
 
 
@@ -179,4 +167,4 @@ def _parted(actions: Any, space: Any) -> tuple[Any, np.ndarray]:
     if numbers is None or numbers.shape != space.shape or not np.isfinite(numbers).all():
         raise ValueError(f"actions must be finite with shape {space.shape}, got {shown(actions)}")
     given, asked = np.asarray(actions), np.asarray(numbers[..., -1] > 0.0)
-    return (given[..., 0][()] if isinstance(space, MultiDiscrete) else given[..., :-1].copy()), asked
+    return given[..., :-1].copy(), asked

@@ -57,8 +57,7 @@ class NetworkSettings:
         for part, channel in zip(self.parts, self.channels, strict=True):
             if channel.quantization_step and not has_floats(part.space):
                 raise ValueError(f"{shown(part.space)} has no floats to quantize: leave out quantization_step")
-        if len({channel.on_request for channel in self.channels}) > 1:
-            raise ValueError("samples are taken on request on all channels or on none")
+            _require_own_time(channel)
         self.keys = None if self.parts[0].key is None else [part.key for part in self.parts]
         self.channel = self.by_part(self.channels)
         self.downlink = as_channel(settings["downlink"], "downlink")
@@ -99,7 +98,7 @@ class NetworkSettings:
     def links(self, count: int) -> dict[tuple[str, Any], EpisodeChannels]:
         """Returns the channels of so many environments by direction and key, those of the commands last."""
         pairs = zip(self.parts, self.channels, strict=True)
-        up = {("channel", part.key): EpisodeChannels(each, partial(_require_like, each), count) for part, each in pairs}
+        up = {("channel", part.key): EpisodeChannels(each, _require_own_time, count) for part, each in pairs}
         require = partial(_require_downlink, self.downlink)
         return {**up, ("downlink", None): EpisodeChannels(self.downlink, require, count)}
 
@@ -203,9 +202,9 @@ def _has_choices(actions: spaces.Space) -> bool:
     return isinstance(actions, spaces.Discrete | spaces.MultiDiscrete)
 
 
-def _require_like(declared: Channel, channel: Channel) -> None:
-    if channel.on_request != declared.on_request:
-        raise ValueError(f"the environment was made for channels with on_request={declared.on_request}")
+def _require_own_time(channel: Channel) -> None:
+    if channel.on_request:
+        raise ValueError("samples on request are for an NCSEnv: leave out on_request")
 
 
 def _require_downlink(declared: Channel | None, channel: Channel) -> None:

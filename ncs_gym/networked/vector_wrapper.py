@@ -85,8 +85,6 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
                     f"VectorNetworked takes {name} that are one array, not {shown(space)}: put Networked around each "
                     "environment"
                 )
-        if settings.channels[0].on_request:
-            raise ValueError("samples on request are for single environments: make each with Networked")
         RecordConstructorArgs.__init__(self, **settings.recorded)
         VectorWrapper.__init__(self, env)
         self.single_observation_space = settings.entries.space

@@ -12,9 +12,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from ncs_gym.envs.env import NCSEnv
-from ncs_gym.network.channel import Channel, require_on_request
+from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.network.requests import Requests
 from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,
@@ -24,7 +23,7 @@ from ncs_gym.networked.network_settings import (
     require_no_network,
     require_no_restarts,
 )
-from ncs_gym.networked.observations import OLDEST_OBSERVED, joined, quantized, snapshot, zero_of
+from ncs_gym.networked.observations import joined, quantized, snapshot, zero_of
 from ncs_gym.validation import shown
 
 
@@ -112,8 +111,6 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         self.observation_space = settings.entries.space
         self._links = settings.links(1)
         *self._uplinks, self._downlinks = self._links.values()
-        on_request = settings.channels[0].on_request
-        self._requests = Requests(settings.channels[0], None) if on_request else None
         self._network: Any = None  # what infos say of it in this episode
         self._arrivals = [_Arrivals() for _ in settings.parts]
         self._sees_newest = settings.keys is None and settings.fill == "last" and not settings.entries.names
@@ -156,8 +153,6 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             arrivals.begin(ChannelState(links.now[0], rng), part.of(sample))
         settings, given = self._settings, self.episode_downlink
         self._actuator = None if given is None else _Actuator(settings, ChannelState(given, rng))
-        if self._requests is not None:
-            self._requests.begin()
         idle = settings.neutral if settings.neutral is not None else nothing(self.action_space)
         self._decided: deque[Any] = deque([idle] * settings.pending, settings.pending)
         return self._seen(), self._with_network(info, idle, 0)
@@ -173,15 +168,13 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             applied, action_age = self._actuator.exchange(rng, step, snapshot(action))
         if self._keeps_actions:
             self._decided.append(snapshot(action))
-        if self._requests is not None:
-            self._requests.decide(self._oldest)
         # A copy: environments may change their actions in place, and this one may act again.
         observation, reward, terminated, truncated, info = self.env.step(snapshot(applied))
         self._step = step = step + 1
         sample = None
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
             link, packet = arrivals.link, None
-            if link.sends_at(step) if self._requests is None else self._requests.requested:
+            if link.sends_at(step):
                 if sample is None:
                     sample = snapshot(observation)
                 own = part.of(sample)
@@ -191,34 +184,6 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
                 self._packets += 1
             arrivals.take(link.carry(rng, step, packet))
         return self._seen(), reward, terminated, truncated, self._with_network(info, applied, action_age)
-
-    def request(self, asked: bool = True) -> None:
-        """Asks for samples in the next step, where the channel takes them on request (`RequestActions`).
-
-        Raises:
-            ValueError: If the channel sends samples by itself, or what is given is no bool.
-        """
-        require_on_request(self._requests).ask(asked)
-
-    @property
-    def outstanding(self) -> int:
-        """Number of samples requested that are newer than the newest that arrived and may still arrive."""
-        return int(require_on_request(self._requests).outstanding(self._oldest))
-
-    @property
-    def request_state(self) -> tuple[int, int]:
-        """The age of the newest sample, of several the oldest, and `outstanding` [steps, samples]."""
-        return self._oldest, self.outstanding
-
-    @property
-    def request_limits(self) -> np.ndarray:
-        """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
-        delays = [channel.longest_delay for channel in self._settings.channels]
-        return np.array([OLDEST_OBSERVED, max(*delays, 1)], dtype=np.float64)
-
-    @property
-    def _oldest(self) -> int:
-        return self._step - min(arrivals.stamp for arrivals in self._arrivals)
 
     def _seen(self) -> Any:
         """Returns what the agent sees now."""

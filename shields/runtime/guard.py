@@ -115,7 +115,8 @@ class Guard(CopiedWhole, ABC):
 
     def info(self) -> dict[str, Any]:
         """Returns the keys of `info`, and counts: once after each `begin` or `observe`."""
-        decided, proposed, code, size = self._decision, self._proposed, self.code, self._size
+        decided, proposed, size = self._decision, self._proposed, self._size
+        code = self._monitor.reasons(self._state, self.belief.age)
         is_proved = not code if size is None else code == 0
         self._count, self._proved = self._count + self._counted, self._proved + (is_proved & self._counted)
         self._interventions = self._interventions + decided.intervened

@@ -294,17 +294,6 @@ class SafetyFilter(ReadOnlyArrays):
         x_hat, errors = _as_array(estimate), self.errors_of(error_shape)
         return x_hat.shape == (self.plant.n,) and bool(self.test.knows_inside(x_hat, errors, MARGIN))
 
-    def fallback_input(self, estimate: np.ndarray) -> np.ndarray:
-        """Returns K x_hat, shape (m,), clipped to the limits and rounded to what a float32 action can express.
-
-        Raises:
-            ValueError: If the estimate is not finite or does not have shape (n,), or K x_hat overflows.
-        """
-        gained = self._gained(_as_column(_as_array(estimate), self.plant.n))[:, 0]
-        if not np.isfinite(gained).all():
-            raise ValueError(f"the estimate must be finite with shape ({self.plant.n},), got {shown(estimate)}")
-        return gained
-
     def _project(self, decided: Decision, some: np.ndarray, sets: ReachableSets) -> None:
         """Puts the closest input that passes, where there is one, in the place of some of those decided."""
         if some.size:

@@ -20,7 +20,6 @@ from ncs_gym import (
     GilbertElliott,
     Networked,
     RandomChannel,
-    RequestActions,
     TraceChannel,
     VectorNetworked,
 )
@@ -28,6 +27,8 @@ from tests.ncs_gym.networked.environments import Counter, Sampled, ages_of_trace
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
 LATE = Channel(loss=0.3, delay=1, jitter=2)
+REQUESTED = Channel(on_request=True)
+ASKING = {"channel": REQUESTED}
 NEUTRAL = {"Pendulum-v1": np.zeros(1, np.float32), "CartPole-v1": 0}
 EVERYTHING = {
     "channel": Channel(loss=BURSTS, delay=1, jitter=2, send_period=2),
@@ -379,41 +380,6 @@ def test_channels_of_several_sensors_are_drawn_by_their_keys():
         RandomChannel(Networked(gym.make("CartPole-v1")), {"a": DELAYED})
 
 
-@pytest.mark.parametrize("make", [Counter, lambda: gym.wrappers.DtypeObservation(gym.make("CartPole-v1"), np.float64)])
-def test_requests_keep_the_type_of_observations_and_actions(make):
-    env = RequestActions(Networked(make(), Channel(on_request=True)))
-    env.action_space.seed(0)
-    seen = [env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(5))]
-    assert {each.dtype for each in seen} == {env.observation_space.dtype, np.dtype(np.float64)}
-    assert all(map(env.observation_space.contains, seen))
-    with pytest.raises(ValueError, match="an entry more of a vector of numbers, got Discrete"):
-        RequestActions(Networked(gym.make("FrozenLake-v1"), Channel(on_request=True)))
-
-
-@pytest.mark.parametrize("delay", [0, 1, 2])
-def test_a_sample_that_cannot_arrive_any_more_is_not_outstanding(delay):
-    env = RequestActions(Networked(Counter(), Channel(on_request=True, loss=1.0, delay=delay)))
-    env.reset(seed=0)
-    seen = [env.step(np.array([0.0, 1.0 if k == 0 else -1.0]))[0][-1] for k in range(5)]
-    assert seen == [1.0] * delay + [0.0] * (5 - delay)
-
-
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_samples_on_request_cost_and_come_only_then(env_id):
-    env = RequestActions(Networked(gym.make(env_id), Channel(on_request=True)), cost=0.5)
-    bare = gym.make(env_id)
-    env.reset(seed=0), bare.reset(seed=0)
-    for k in range(8):
-        ask = k % 3 == 0
-        action = [0, int(ask)] if env_id == "CartPole-v1" else np.array([0.5, 1.0 if ask else -1.0], np.float32)
-        seen, reward, *_, info = env.step(np.array(action))
-        wanted, plain, *_ = bare.step(0 if env_id == "CartPole-v1" else np.array([0.5], np.float32))
-        assert reward == pytest.approx(plain - 0.5 * ask)
-        assert info["measurement_age"] == k % 3
-        assert np.array_equal(seen[:-2], wanted) == ask
-        assert seen[-2] == k % 3
-
-
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
@@ -451,12 +417,11 @@ def test_networks_that_do_not_fit_are_one_sentence():
         Networked(gym.make("FrozenLake-v1"), Channel(quantization_step=0.1))
     with pytest.raises(ValueError, match="has no zero"):
         Networked(gym.wrappers.TransformObservation(Counter(), None, gym.spaces.Box(1.0, 2.0, (1,))), fill="zero")
-    with pytest.raises(ValueError, match="made for channels with on_request=False"):
-        Networked(Counter()).reset(options={"channel": Channel(on_request=True)})
+    for wrong in (lambda: Networked(Counter(), REQUESTED), lambda: Networked(Counter()).reset(options=ASKING)):
+        with pytest.raises(ValueError, match="samples on request are for an NCSEnv"):
+            wrong()
     with pytest.raises(ValueError, match="has an ideal downlink"):
         Networked(Counter()).reset(options={"downlink": Channel()})
-    with pytest.raises(ValueError, match="sends samples by itself"):
-        Networked(Counter()).request()
     with pytest.raises(ValueError, match="a function for fill is for one channel"):
         Networked(Counter("dict"), {"count": Channel()}, fill=lambda *given: None)
     with pytest.raises(ValueError, match="Autoreset inside begins episodes"):

@@ -191,8 +191,6 @@ def test_channels_of_episodes_are_drawn_also_where_they_begin_by_themselves():
 
 
 def test_what_vector_environments_cannot_have_is_one_sentence():
-    with pytest.raises(ValueError, match="samples on request are for single environments"):
-        VectorNetworked(SyncVectorEnv([Counter]), Channel(on_request=True))
     with pytest.raises(ValueError, match=r"takes vector environments, as gym.make_vec returns, got <"):
         VectorNetworked(gym.make("Pendulum-v1"))
     with pytest.raises(ValueError, match="an NCSVectorEnv has one"):

@@ -8,7 +8,7 @@ from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 from tests.product import altered, safety_filter
-from tests.shields.edges import edge_of
+from tests.shields.edges import edge_of, gained
 from tests.shields.runtime.batches import decided_alike
 
 TWO_STATES = random_plant(3, 2, 1)
@@ -185,7 +185,7 @@ def test_proposed_fallback_is_no_intervention(case):
         shield, seen = safety_filter(certificate, plant, mode), 0
         for _ in range(200):
             estimate = 3.0 * certificate.safe_set.sample(rng)
-            decision = shield.decide(estimate, certificate.Sigma, shield.fallback_input(estimate))
+            decision = shield.decide(estimate, certificate.Sigma, gained(shield, estimate))
             assert not decision.intervened
             seen += decision.reason == "fallback"
         assert seen > 5
@@ -223,7 +223,7 @@ def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
         assert (decision.reason == "safe") is all_pass
         seen.add(decision.reason)
         if not all_pass:
-            np.testing.assert_array_equal(decision.input, boundary.fallback_input(estimate))
+            np.testing.assert_array_equal(decision.input, gained(boundary, estimate))
     assert "fallback" in seen
 
 
@@ -258,7 +258,7 @@ def random_cases(rng, shield, count):
     shapes = factor @ inner @ inner.swapaxes(1, 2) @ factor.T
     inputs = rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.u_max
     inputs[::7] = plant.u_max
-    inputs[::11] = [shield.fallback_input(estimate) for estimate in estimates[::11]]
+    inputs[::11] = [gained(shield, estimate) for estimate in estimates[::11]]
     estimates[3], estimates[4], estimates[5, 0], estimates[6] = 1e200, np.nan, np.inf, 0.0
     shapes[8], shapes[9], shapes[10], shapes[12, 0, 0] = 0.0, np.nan, -shapes[10], np.inf
     inputs[13, -1], inputs[14], inputs[15, 0] = np.nan, 1.1 * plant.u_max, -np.inf
