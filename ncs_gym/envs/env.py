@@ -283,21 +283,6 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
             guard.lost.tell()
         return observation, reward, terminated, truncated, info
 
-    @property
-    def request_state(self) -> tuple[int, int]:
-        """The age of the newest sample used, and `outstanding` [steps, samples]."""
-        return self._now.estimator.age, self.outstanding
-
-    @property
-    def request_limits(self) -> np.ndarray:
-        """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
-        input_delay, contract = len(self._now.pending), self.contract
-        if contract is None:
-            most = self._horizon, max(self.channel.longest_delay + input_delay, 1)
-        else:
-            most = contract.max_age, contract.max_age + input_delay
-        return np.array(most, dtype=np.float64).clip(min=1.0)
-
     def render(self) -> np.ndarray | None:
         """Returns an image, shape (height, width, 3), uint8; None in mode "human", which shows every step by itself.
 

@@ -195,7 +195,7 @@ def test_attributes():
     for call in (
         lambda: env.get_attr("nothing"),
         *(partial(env.get_attr, name) for name in ("steps", "state", "known", "starts")),
-        *(partial(env.get_attr, name) for name in ("start", "request_state", "episode_channel")),
+        *(partial(env.get_attr, name) for name in ("start", "episode_channel")),
         lambda: env.set_attr("plant", 1),
         lambda: env.env_method("reset"),
     ):
