@@ -31,7 +31,7 @@ SETTINGS = {
 }
 
 
-@pytest.mark.cases(6)
+@pytest.mark.cases(12)
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
 @pytest.mark.parametrize("settings", SETTINGS.values(), ids=list(SETTINGS))
 def test_one_environment_is_that_of_the_single_network(env_id, settings):

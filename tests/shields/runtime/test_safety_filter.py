@@ -214,7 +214,7 @@ def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
     boundary, switch = safety_filter(certificate, plant, "boundary"), safety_filter(certificate, plant, "switch")
     rng = np.random.default_rng(7)
     seen = set()
-    for _ in range(300):
+    for _ in range(120):
         estimate, shape = certificate.safe_set.sample(rng) * rng.uniform(0, 1.2), 0.1 * certificate.Sigma
         u = rng.uniform(-1, 1, plant.m) * plant.u_max
         decision = boundary.decide(estimate, shape, u)
