@@ -6,15 +6,12 @@ holds, and `guard` is both for one loop, or for N, the last axis of all arrays; 
 """
 
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import GuaranteeMonitor, MonitorState
 from shields.runtime.safe_loop import SafeLoop
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.wrapper import SafetyShield, VectorSafetyShield
 
 __all__ = [
     "Decision",
-    "GuaranteeMonitor",
-    "MonitorState",
     "SafeLoop",
     "SafetyFilter",
     "SafetyShield",

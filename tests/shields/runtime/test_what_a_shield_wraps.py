@@ -164,10 +164,11 @@ def test_a_loop_that_moves_without_its_guard_proves_nothing_until_the_next_reset
         assert np.all(shield.reset(seed=0)[1]["shield_guaranteed"])
         assert np.all(shield.step(action)[-1]["shield_guaranteed"])
         env._now.move(env.np_random, np.zeros(np.shape(env.belief.applied)))
-        for _ in range(3):
+        for states in (3, 4, 5):
             info = shield.step(action)[-1]
             assert np.all(info["shield_reason"] == OTHER_STEPS)
             assert not np.any(info["shield_guaranteed"])
+            assert np.all(info["episode_guaranteed"] == 2 / states)
 
 
 @pytest.mark.parametrize("made", [scalar, vector])
