@@ -150,11 +150,6 @@ def downlinks(declared: Channel | None, protocol: DownlinkProtocol, dt: float, c
     return EpisodeChannels(declared, partial(_require_downlink, protocol, dt), count)
 
 
-def channel_infos(up: EpisodeChannels, down: EpisodeChannels, *, many: bool = False) -> dict[str, Any]:
-    """Returns what infos say of the channels of the present episodes, of N environments arrays of shape (N,)."""
-    return up.infos("channel", many=many) | down.infos("downlink", many=many)
-
-
 def covering(channels: Sequence[Channel], declared: Channel) -> Channel:
     """Returns a channel with the delays of all, and the quantization step that environments were made for."""
     shortest = min(channel.delay for channel in channels)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.envs.episode_channels import channel_infos, covering, downlinks, uplinks
+from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.loop_settings import expect, loop_contracts, starting_set
 from ncs_gym.envs.report import Beginning, Belief, Report
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
@@ -159,6 +159,10 @@ class LoopState(CopiedWhole, ABC):
         for links, each in zip(self.links.values(), sources, strict=True):
             links.give(each, chosen)
 
+    def _channel_infos(self) -> dict[str, Any]:
+        many = self._size is not None
+        return self.channels.infos("channel", many=many) | self.downlinks.infos("downlink", many=many)
+
     def move(self, rng: np.random.Generator, u: np.ndarray) -> tuple[Inputs, Any]:
         """Moves one step on; returns the inputs of the step, and whether a packet arrived, a bool or shape (N,).
 
@@ -259,7 +263,7 @@ class OneLoop(LoopState):
         self.memory = self.process.begin(rng)
         for links in self.links.values():
             links.begin(rng)
-        self._others = channel_infos(self.channels, self.downlinks)
+        self._others = self._channel_infos()
         channel = self.channels.now[0]
         self.network, self.packets = ChannelState(channel, rng), 0
         if self.requests is not None:
@@ -311,7 +315,7 @@ class ManyLoops(LoopState):
         memory = self.process.begin(rng, count)
         channels, commands = self.channels.begin(rng, rows), self.downlinks.begin(rng, rows)
         if count == self.size or not (self.channels.is_plain and self.downlinks.is_plain):
-            self._others = channel_infos(self.channels, self.downlinks, many=True)
+            self._others = self._channel_infos()
         if count == self.size:
             self.memory = np.array(memory)
             self.network = VectorChannelState(channels or loop.channel, rng, count)

@@ -46,10 +46,6 @@ class Plans(NamedTuple):
     lengths: np.ndarray
     distances: np.ndarray
 
-    def some(self, chosen: np.ndarray) -> Plans:
-        """Returns those of some environments, given by their indices."""
-        return Plans(*(part[chosen] for part in self))
-
 
 class Planner:
     """Finds certified plans (docs/lookahead.md).
