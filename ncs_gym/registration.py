@@ -97,8 +97,7 @@ class Factory:
 
         Args:
             plant: The plant; None for the default one.
-            between_samples: Times per step at which the box counts (`LinearPlant`), 1 for the sampling instants alone;
-                None for the plant's own.
+            between_samples: Times per step at which the box counts (`LinearPlant`); None for the plant's own.
             given: Other arguments of `NCSEnv`; None stands for the default where there is one.
 
         Raises:
@@ -128,16 +127,10 @@ class Factory:
         for name, value in given.items():
             if name in kinds or name == "terminate_on_violation":
                 if value is not None:
-                    own[name] = self._object(value, kinds[name], name) if name in kinds else value
+                    own[name] = from_json(value, kinds[name], name) if name in kinds else value
             else:
                 own[name] = value
         return own
-
-    def _object(self, value: Any, kinds: tuple[type, ...], name: str) -> Any:
-        """Returns what a JSON value stands for; of many environments, each may have a channel of its own."""
-        if self.is_vector and kinds == (Channel,) and isinstance(value, (list, tuple)):
-            return [from_json(each, kinds, name) for each in value]
-        return from_json(value, kinds, name)
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -308,10 +301,7 @@ def register_all() -> None:
 
 
 def registered_ids() -> list[str]:
-    """Returns the ids of the environments that have a plant of their own: this module's, and those of users' plants.
-
-    An environment whose extra is not installed is not among them.
-    """
+    """Returns the ids of environments with a plant of their own, users' included, whose extra is installed."""
     own = [env_id for env_id, each in ENVIRONMENTS.items() if each.plant is not None and each.is_installed]
     entry_point = _entry_points(_LINEAR_NCS)["entry_point"]
     return own + [spec.id for spec in gym.registry.values() if spec.entry_point == entry_point and spec.kwargs]
@@ -332,25 +322,11 @@ def register_plant(
     max_episode_steps: int = EPISODE_STEPS,
     **settings: Any,
 ) -> None:
-    """Registers a plant as a Gymnasium environment, scalar and vectorized, with a time limit.
+    """Registers a plant as a Gymnasium environment, scalar and vectorized, with a time limit (docs/own_plant.md).
 
-    With this in a module `tank.py`:
-
-        from ncs_gym import Bounds, Channel, Limits, LinearPlant, Model, register_plant
-
-        A, B = [[0.98, 0.04], [0.0, 0.95]], [[0.0], [0.05]]  # levels of two tanks [m], by a valve [l/s]
-        plant = LinearPlant(
-            Model(A, B, H=None, dt=1.0),
-            Limits(state=[0.3, 0.5], input=2.0),  # |x_1| <= 0.3 m, |x_2| <= 0.5 m at every step
-            Bounds(disturbance=[0.001, 0.002], sensor=0.01, first_error=0.01),  # per step what is not modeled does [m]
-        )
-        register_plant("Plants/Tanks-v0", plant, channel=Channel(loss=0.3, delay=2))
-
-    the id works wherever Gymnasium's do, and for the commands (which import the module before the colon):
-
-        gym.make("tank:Plants/Tanks-v0")
-        gym.make_vec("tank:Plants/Tanks-v0", num_envs=64)
-        ncs compare --env tank:Plants/Tanks-v0
+    With `register_plant("Plants/Tanks-v0", plant, channel=Channel(loss=0.3))` in a module `tank.py` the id works
+    wherever Gymnasium's do, `gym.make("tank:Plants/Tanks-v0")`, and for the commands, `ncs compare --env
+    tank:Plants/Tanks-v0`.
 
     Args:
         env_id: Id, such as "Plants/Tanks-v0".
@@ -359,10 +335,8 @@ def register_plant(
         channel: The network; a perfect one by default.
         task: The reward; `Regulation` by default.
         contract: What the channel promises; by default that of the channel if the plant is unstable, else none.
-        max_episode_steps: Steps after which an episode is truncated.
-        settings: Other keywords of `NCSEnv`: `process`, `disturbance`, `noise`, `initial_set`,
-            `terminate_on_violation`, `allow_assumption_violation`, `downlink`, `downlink_contract` and `observe`.
-            `horizon` is always `max_episode_steps`, whatever is given.
+        max_episode_steps: Steps after which an episode is truncated; also the `horizon`.
+        settings: Other keywords of `NCSEnv`.
 
     Raises:
         UnstablePlantError: If the plant is not Schur stable and there is no contract.

@@ -25,7 +25,6 @@ class Autoreset:
     Attributes:
         mode: The mode.
         over: Which episodes are over, shape (N,).
-        begun: Which began in the last step, shape (N,).
 
     Raises:
         ValueError: If there is no such mode.
@@ -37,7 +36,7 @@ class Autoreset:
         if not (isinstance(name, str) and name in modes):
             raise ValueError(f"autoreset_mode must be one of {[*modes]}, got {shown(mode)}")
         self.mode = modes[name]
-        self._nothing = self.over = self.begun = np.zeros(count, np.bool_)
+        self._nothing = self.over = np.zeros(count, np.bool_)
 
     def require_under_way(self) -> None:
         """Raises ResetNeeded if an episode is over and nobody but the caller begins another one."""
@@ -52,7 +51,6 @@ class Autoreset:
             begin: Begins episodes where a mask, shape (N,), says so; returns first observations and infos.
         """
         observation, reward, terminated, truncated, info = move()
-        self.begun = self.over
         if np.count_nonzero(self.over):  # NEXT_STEP: the last step ended these episodes
             first, fresh = begin(self.over)
             observation, info = _merged(self.over, first, observation), _merged_infos(self.over, fresh, info)
@@ -60,7 +58,7 @@ class Autoreset:
             terminated, truncated = terminated & ~self.over, truncated & ~self.over
         self.over = terminated | truncated
         if self.mode is AutoresetMode.SAME_STEP and np.count_nonzero(self.over):
-            done, self.begun, self.over = self.over, self.over, self._nothing
+            done, self.over = self.over, self._nothing
             blank = {key: np.full_like(value, "" if value.dtype == object else 0) for key, value in info.items()}
             final = _merged_infos(done, info, blank) | {f"_{key}": done.copy() for key in info}
             first, fresh = begin(done)
@@ -75,7 +73,6 @@ class Autoreset:
 
 
 def _merged(mask: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the first array where a mask (N,) is True, the second elsewhere; both have N as first axis."""
     return np.where(mask.reshape(-1, *[1] * (first.ndim - 1)), first, second)
 
 

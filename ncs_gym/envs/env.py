@@ -44,7 +44,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
 
     ## Observation space
     A finite `Box` of float32, sized by what the plant and the task can reach within `horizon` steps, for an unstable
-    plant by what one step out of the safe box can reach. What is beyond is clipped, in `info` it is not:
+    plant by what one step out of the safe box can reach. Observations are clipped; `info` is not:
 
     | entries | meaning | unit |
     |---|---|---|
@@ -112,25 +112,25 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         plant: The plant with its bounds.
         channel: The network; a perfect one by default.
         task: The reward; `Regulation` by default.
-        disturbance: "ball", "box", "sinusoid" (truncated process noise is added), "sphere", "adversarial" (in
-            its place), a `Disturbance`, or a callable (rng, plant, nominal_next) -> d.
+        disturbance: "ball", "box", "sinusoid" (truncated process noise is added), "sphere", "adversarial" (in its
+            place), a `Disturbance`, or a function (rng, plant, nominal_next) -> d.
         initial_set: Ellipsoid of starting states; by default a tenth of the safe box, where its ends are not symmetric
             about the operating point of the largest box inside that is; states without a limit start at that point.
         terminate_on_violation: End the episode when the true state leaves the safe box.
         allow_assumption_violation: Let disturbances outside the certified bound pass instead of raising; infos say so.
-        contract: What the channel promises, for unstable plants (docs/contracts.md); by default that of the channel
-            if the plant is unstable, none if it is stable. A channel that may break it is allowed.
+        contract: What the channel promises (docs/contracts.md); by default that of the channel if the plant is
+            unstable, none if it is stable. A channel that may break it is allowed.
         render_mode: "human" shows every step in a window, "rgb_array" makes `render` return an image; both need
             the extra `[render]` (docs/ncs_gym.md).
         horizon: Steps the observation space is sized for; give it beside a longer `max_episode_steps`.
-        noise: "truncated"; "gaussian" for process noise, sensor noise and first errors without a bound: what is
-            proved then holds but for a probability that `bound_violation_probability` bounds (docs/shield.md); or
-            "extreme" for sensor noise and first errors as large as assumed, in random directions.
-        process: What really moves (docs/beyond_linear.md); by default the plant's own equations, or those of a member
-            of its family (`ncs_gym.family`), another one in every episode.
+        noise: "truncated"; "gaussian" for noise and first errors without a bound, where what is proved holds except
+            with probability at most `bound_violation_probability` (docs/shield.md); or "extreme" for sensor noise and
+            first errors as large as assumed, in random directions.
+        process: What really moves (docs/beyond_linear.md); by default the plant's own equations, or those of another
+            member of its family in every episode.
         downlink: The network between controller and actuator (docs/contracts.md); ideal by default.
-        downlink_contract: What is assumed of the downlink, which may then break it; by default what the downlink's
-            settings guarantee.
+        downlink_contract: What is assumed of the downlink, which may then break it; by default what its settings
+            guarantee.
         observe: What observations hold besides, after the task's entries: "age", that of the newest sample used
             [steps], and "error", the n half-widths of the error's ellipsoid E(Sigma_k) [units of the states].
 
@@ -217,10 +217,9 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
             seed: Seeds `np_random`, the only source of randomness, and the generator of the task that it spawns.
             options: {"state": x0} starts at x0, shape (n,). {"channel": c}, {"downlink": c} give this episode another
                 channel, a `Channel` or a function (rng) -> Channel that draws one. Contract, error set and spaces stay
-                those that the environment was made with: a channel that cannot keep the contract may break it, as ever,
-                one that rounds more coarsely than the environment's own, or delays commands by more than its
-                downlink commits ahead, is refused. {"parameters": {name: value}} fixes parameters of the member of a
-                family that moves in this episode; others are drawn.
+                as they are: a channel may break the contract, but one that rounds more coarsely than the environment's
+                own, or delays commands by more than its downlink commits ahead, is refused. {"parameters": {name:
+                value}} fixes parameters of the member of a family that moves in this episode; others are drawn.
 
         Raises:
             ValueError: If an option is unknown or wrong, or the environment cannot have the channel.
@@ -284,21 +283,6 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
             guard.lost.tell()
         return observation, reward, terminated, truncated, info
 
-    @property
-    def request_state(self) -> tuple[int, int]:
-        """The age of the newest sample used, and `outstanding` [steps, samples]."""
-        return self._now.estimator.age, self.outstanding
-
-    @property
-    def request_limits(self) -> np.ndarray:
-        """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
-        input_delay, contract = len(self._now.pending), self.contract
-        if contract is None:
-            most = self._horizon, max(self.channel.longest_delay + input_delay, 1)
-        else:
-            most = contract.max_age, contract.max_age + input_delay
-        return np.array(most, dtype=np.float64).clip(min=1.0)
-
     def render(self) -> np.ndarray | None:
         """Returns an image, shape (height, width, 3), uint8; None in mode "human", which shows every step by itself.
 
@@ -315,12 +299,12 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
 
     @property
     def episode_channel(self) -> Channel:
-        """The channel of this episode."""
+        """See the class."""
         return self._now.channels.now[0]
 
     @property
     def episode_downlink(self) -> Channel | None:
-        """The downlink of this episode; None for an ideal one."""
+        """See the class; None for an ideal one."""
         return self._now.downlinks.now[0]
 
     def close(self) -> None:
@@ -336,8 +320,8 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         return self._observer.observation(self._belief, self._task.observe(task_state))
 
 
-def note_of(guard: Any, info: dict[str, Any], loop: int = 0) -> Annotation | None:
-    """Returns what the picture of the last step shows of a guard, given the info of a loop; None without a guard."""
+def note_of(guard: Any, info: dict[str, Any]) -> Annotation | None:
+    """Returns what the picture of the last step shows of a guard, given its info; None without a guard."""
     if guard is None:
         return None
     judge = guard.filter
@@ -348,16 +332,12 @@ def note_of(guard: Any, info: dict[str, Any], loop: int = 0) -> Annotation | Non
         intervened=bool(info["shield_intervened"]),
         interventions=int(info["episode_interventions"]),
         protects=judge.mode != "monitor",
-        plan=guard.plan(loop) if judge.mode == "lookahead" else None,
+        plan=guard.plan() if judge.mode == "lookahead" else None,
     )
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:
-    """Returns the environment inside all wrappers.
-
-    Raises:
-        ValueError: If it is not an `NCSEnv`.
-    """
+    """Returns the environment inside all wrappers; raises ValueError if it is not an `NCSEnv`."""
     inner = env.unwrapped
     if not isinstance(inner, NCSEnv):
         raise ValueError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,71 +16,58 @@ from ncs_gym.network.channel import Channel, require_duration
 from ncs_gym.network.downlink import DownlinkProtocol, require_fitting_downlink
 from ncs_gym.validation import AroundEnvironments, shown
 
-# Draws a channel; and which one: the option of `reset`, and of several channels the key.
-_Draw = Callable[[np.random.Generator], Any]
-_Which = tuple[str, Any]
-
-
-class EveryEpisode(NamedTuple):
-    """What the episodes of an environment draw their channels from, also those that begin by themselves.
-
-    Attributes:
-        draw: A function (rng) -> Channel.
-        first: Takes its place in the first of these episodes: a channel, or what draws one; None for nothing. As an
-            option of a vector environment it may be a list of these.
-    """
-
-    draw: Callable[[np.random.Generator], Channel]
-    first: Any = None
+# Draws a channel, or the fields of one.
+Draw = Callable[[np.random.Generator], Any]
 
 
 class EpisodeChannels:
     """The channels of N environments in their present episodes, in one direction.
 
+    A source is a channel or a function (rng) -> Channel; None stands for the environments' own.
+
     Args:
-        own: The channels that the environments were made with; None for an ideal one.
+        declared: The channel that the environments were made with; None for an ideal one.
         require_fitting: Raises ValueError for a channel that the environments cannot have.
+        count: N.
 
     Attributes:
         now: Those of the present episodes.
-        is_plain: Whether all have the same one, and will have it in the next episode, too.
+        is_plain: Whether all have the declared one, and will have it in the next episode, too.
     """
 
-    def __init__(self, own: Sequence[Channel | None], require_fitting: Callable[[Channel], None]) -> None:
-        self._own, self._require_fitting = list(own), require_fitting
-        for each in {channel for channel in own if channel is not None}:
-            require_fitting(each)
-        self._sources: list[Any] = self._own
-        self.now: list[Any] = list(own)
-        self._is_uniform = len(set(own)) == 1
-        self.is_plain = self._is_uniform
+    def __init__(self, declared: Channel | None, require_fitting: Callable[[Channel], None], count: int = 1) -> None:
+        self._declared, self._require_fitting = declared, require_fitting
+        if declared is not None:
+            require_fitting(declared)
+        self._own: Channel | Draw | None = declared
+        self._sources: list[Any] = [None] * count
+        self.now: list[Any] = [declared] * count
+        self.is_plain = True
+
+    def draw_from(self, draw: Draw | None) -> None:
+        """Has all episodes that begin from now on draw their channels; None for the declared one again."""
+        self._own, self.is_plain = draw or self._declared, False
 
     def read(self, option: Any, name: str) -> list[Any]:
-        """Returns the sources that an option of `reset` names, one for each environment.
+        """Returns the sources that an option of `reset` names, one for each environment; they are for one episode.
 
         Args:
-            option: None for the environments' own; a channel (or a dictionary of its fields), or what draws one, for
-                all; or N of these. All of them are for one episode, but for `EveryEpisode`.
+            option: A source for all, or N of them; a channel also as a dictionary of its fields.
             name: What the error message calls it.
 
         Raises:
             ValueError: If it is none of these, or a channel that the environments cannot have.
         """
-        count, option = len(self._own), from_json(option, (Channel,), name)
-        if option is None:
-            return self._own
-        if isinstance(option, EveryEpisode):
-            firsts = [None] * count if option.first is None else self.read(option.first, name)
-            return [EveryEpisode(option.draw, first) for first in firsts]
-        each = [option] * count if isinstance(option, Channel) or callable(option) else option
+        count, option = len(self.now), from_json(option, (Channel,), name)
+        each = [option] * count if option is None or isinstance(option, Channel) or callable(option) else option
         each = [from_json(one, (Channel,), name) for one in each] if isinstance(each, (list, tuple)) else each
-        if not isinstance(each, (list, tuple)) or len(each) != count:
+        if not isinstance(each, list) or len(each) != count:
             several = "" if count == 1 else f", or a list of {count} of these"
             raise ValueError(f"{name} must be a Channel or a function (rng) -> Channel{several}, got {shown(option)}")
-        for channel in {id(channel): channel for channel in each if not callable(channel)}.values():
-            if channel is not None:
-                self._checked(channel, name)
-        return [own if given is None else given for given, own in zip(each, self._own, strict=True)]
+        for source in {id(source): source for source in each}.values():
+            if source is not None and not callable(source):
+                self._checked(source, name)
+        return each
 
     def drawn(self, sources: list[Any], rng: np.random.Generator, rows: Sequence[int] | None = None) -> list[Any]:
         """Returns sources in which those that draw have drawn for the next episodes of some environments.
@@ -93,24 +80,19 @@ class EpisodeChannels:
         Raises:
             ValueError: If what was drawn is no channel that the environments can have; nothing has changed then.
         """
-        if not any(callable(each) or isinstance(each, EveryEpisode) for each in sources):
-            return sources
         found = list(sources)
-        for e in range(len(found)) if rows is None else rows:
-            if isinstance(each := found[e], EveryEpisode):
-                found[e] = each._replace(first=self._channel(each.draw if each.first is None else each.first, rng))
-            else:
-                found[e] = self._channel(each, rng)
+        if callable(self._own) or any(map(callable, sources)):
+            for e in range(len(found)) if rows is None else rows:
+                found[e] = self._channel(found[e], rng)
         return found
 
     def give(self, sources: list[Any], chosen: Sequence[int] | None = None) -> None:
-        """Takes what `read` returned for some environments, given by their indices; for all by default."""
-        if chosen is None or len(chosen) == len(self._own):
-            self._sources = list(sources)
-            self.is_plain = self._is_uniform and sources is self._own
-            self.now = list(self._own)
-        elif sources is not self._own or not self.is_plain:
-            self._sources, self.is_plain = list(self._sources), False
+        """Takes sources for the next episodes of some environments, given by their indices; of all by default."""
+        if chosen is None or len(chosen) == len(self.now):
+            self._sources, self.now = list(sources), [self._declared] * len(self.now)
+            self.is_plain = sources == [None] * len(sources)
+        elif not self.is_plain or any(sources[e] is not None for e in chosen):
+            self.is_plain = False
             for e in chosen:
                 self._sources[e] = sources[e]
 
@@ -118,7 +100,7 @@ class EpisodeChannels:
         """Draws the channels of episodes that begin in some environments, given by their indices; in all by default.
 
         Returns:
-            Those of all environments; None if all have the same one, as before.
+            Those of all environments; None if all have the declared one, as before.
 
         Raises:
             ValueError: If what was drawn is no channel that the environments can have.
@@ -126,11 +108,7 @@ class EpisodeChannels:
         if self.is_plain:
             return None
         for e in range(len(self.now)) if rows is None else rows.tolist():
-            source, later = self._sources[e], self._own[e]
-            if isinstance(source, EveryEpisode):
-                source, later = source.draw if source.first is None else source.first, EveryEpisode(source.draw)
-            self.now[e] = self._channel(source, rng)
-            self._sources[e] = later
+            self.now[e], self._sources[e] = self._channel(self._sources[e], rng), None
         return self.now
 
     def infos(self, name: str, *, many: bool) -> dict[str, Any]:
@@ -147,7 +125,7 @@ class EpisodeChannels:
         return {f"{name}_loss": np.array(losses), f"{name}_delay": np.array(delays)}
 
     def _channel(self, source: Any, rng: np.random.Generator) -> Any:
-        """Returns the channel of an episode: what is given, or what it draws."""
+        source = self._own if source is None else source
         if not callable(source):
             return source
         return self._checked(from_json(source(rng), (Channel,), "what was drawn"), "what was drawn")
@@ -159,22 +137,17 @@ class EpisodeChannels:
         return channel
 
 
-def uplinks(own: Sequence[Channel], declared: Channel, dt: float) -> EpisodeChannels:
+def uplinks(declared: Channel, dt: float, count: int) -> EpisodeChannels:
     """Returns the channels between sensors and controllers, in steps of duration dt [s].
 
     None may round more coarsely than declared, or send samples on request if the declared one does not, or otherwise.
     """
-    return EpisodeChannels(own, partial(_require_uplink, declared, dt))
+    return EpisodeChannels(declared, partial(_require_uplink, declared, dt), count)
 
 
-def downlinks(own: Sequence[Channel | None], protocol: DownlinkProtocol, dt: float) -> EpisodeChannels:
+def downlinks(declared: Channel | None, protocol: DownlinkProtocol, dt: float, count: int) -> EpisodeChannels:
     """Returns the channels between controllers and actuators, which keep the c steps of duration dt of a protocol."""
-    return EpisodeChannels(own, partial(_require_downlink, protocol, dt))
-
-
-def channel_infos(up: EpisodeChannels, down: EpisodeChannels, *, many: bool = False) -> dict[str, Any]:
-    """Returns what infos say of the channels of the present episodes, of N environments arrays of shape (N,)."""
-    return up.infos("channel", many=many) | down.infos("downlink", many=many)
+    return EpisodeChannels(declared, partial(_require_downlink, protocol, dt), count)
 
 
 def covering(channels: Sequence[Channel], declared: Channel) -> Channel:
@@ -184,11 +157,46 @@ def covering(channels: Sequence[Channel], declared: Channel) -> Channel:
     return Channel(quantization_step=declared.quantization_step, delay=shortest, jitter=longest - shortest)
 
 
-class RandomChannel(gym.Wrapper, RecordConstructorArgs):
+class _Draws(RecordConstructorArgs):
+    """What both wrappers have in common."""
+
+    env: Any
+    _kind: str
+    _wrapper: Any
+
+    def __init__(self, env: Any, channel: Any = None, downlink: Any = None) -> None:
+        RecordConstructorArgs.__init__(self)
+        self._wrapper.__init__(self, env)
+        self.draw_from(channel, downlink)
+
+    def draw_from(self, channel: Any = None, downlink: Any = None) -> None:
+        """Takes the place of what was given: episodes from the next one on draw from it.
+
+        Where environments are in processes of their own, vector environments call it there (docs/ncs_gym.md).
+
+        Raises:
+            ValueError: See the class.
+        """
+        layer = self.env
+        while not hasattr(type(layer), "links") and layer is not layer.unwrapped:
+            layer = layer.env
+        if not hasattr(type(layer), "links"):
+            raise ValueError(f"{type(self).__name__} is for {self._kind}, got {layer}")
+        links: dict[tuple[str, Any], EpisodeChannels] = layer.links
+        drawn = _drawn([key for name, key in links if name == "channel"], channel, downlink)
+        for which, each in links.items():
+            each.draw_from(drawn.get(which))
+        self._saved_kwargs = {"channel": to_json(channel), "downlink": to_json(downlink)}
+        self._cached_spec = None
+
+
+class RandomChannel(_Draws, gym.Wrapper):
     """Draws a channel at the start of every episode (domain randomization over networks).
 
-    The draws come from the environment's own `np_random`, so that a seed determines them. A shield may stand inside or
-    outside. What the environment was made for bounds what may be drawn; see `NCSEnv.reset`.
+    The draws come from the environment's own `np_random`, so that a seed determines them. The wrapper has the
+    environment draw, by whatever name it is called from then on; a shield may stand inside or outside. A channel among
+    the options of `reset` takes the place of a drawn one. What the environment was made for bounds what may be drawn;
+    see `NCSEnv.reset`.
 
     Args:
         env: An `NCSEnv`, or another environment in `Networked`, possibly wrapped.
@@ -201,38 +209,10 @@ class RandomChannel(gym.Wrapper, RecordConstructorArgs):
         ValueError: If neither is given, it is none of these, or the environment has no channel of a key.
     """
 
-    def __init__(self, env: gym.Env, channel: Any = None, downlink: Any = None) -> None:
-        RecordConstructorArgs.__init__(self)
-        if not isinstance(env, gym.Env):
-            raise ValueError(f"RandomChannel takes an environment, as gym.make returns it, got {shown(env)}")
-        gym.Wrapper.__init__(self, env)
-        if not env.has_wrapper_attr("episode_channel"):
-            raise ValueError(f"RandomChannel is for an NCSEnv, or any environment in Networked, got {env.unwrapped}")
-        self.draw_from(channel, downlink)
-
-    def draw_from(self, channel: Any = None, downlink: Any = None) -> None:
-        """Takes the place of what was given: episodes from the next one on draw from it.
-
-        Where environments are in processes of their own, vector environments call it there (docs/ncs_gym.md).
-
-        Raises:
-            ValueError: See `RandomChannel`.
-        """
-        self._keys = _keys(self.env.get_wrapper_attr("channel"))
-        self._drawn = _drawn(self._keys, channel, downlink)
-        self._saved_kwargs = {"channel": to_json(channel), "downlink": to_json(downlink)}
-        self._cached_spec = None
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode; a channel among the options takes the place of a drawn one."""
-
-        def source(which: _Which, first: Any) -> Any:
-            return self._drawn[which] if first is None else first
-
-        return self.env.reset(seed=seed, options=_options(self._keys, self._drawn, options, source))
+    _kind, _wrapper = "an NCSEnv, or any environment in Networked", gym.Wrapper
 
 
-class VectorRandomChannel(AroundEnvironments, VectorWrapper, RecordConstructorArgs):
+class VectorRandomChannel(_Draws, AroundEnvironments, VectorWrapper):
     """`RandomChannel` for an `NCSVectorEnv`: one is drawn for every episode of every one, in any autoreset mode.
 
     Args:
@@ -244,53 +224,12 @@ class VectorRandomChannel(AroundEnvironments, VectorWrapper, RecordConstructorAr
         ValueError: See `RandomChannel`.
     """
 
-    def __init__(self, env: Any, channel: Any = None, downlink: Any = None) -> None:
-        RecordConstructorArgs.__init__(self)
-        VectorWrapper.__init__(self, env)
-        if not hasattr(env, "channel"):
-            raise ValueError(f"VectorRandomChannel is for an NCSVectorEnv or VectorNetworked, got {env.unwrapped}")
-        self._drawn: dict[_Which, _Draw] = {}
-        self.draw_from(channel, downlink)
-
-    def draw_from(self, channel: Any = None, downlink: Any = None) -> None:
-        """See `RandomChannel.draw_from`; also for episodes that begin by autoreset.
-
-        Raises:
-            ValueError: See `RandomChannel`; or if another of channel and downlink was drawn until now.
-        """
-        self._keys = _keys(self.env.channel)  # pyright: ignore[reportAttributeAccessIssue]
-        drawn = _drawn(self._keys, channel, downlink)
-        if self._drawn and drawn.keys() != self._drawn.keys():
-            given = dict.fromkeys(name if key is None else f"{name} of {key!r}" for name, key in self._drawn)
-            raise ValueError(f"draw_from takes the place of what was given: give {' and '.join(given)}")
-        self._drawn = drawn
-        self._saved_kwargs = {"channel": to_json(channel), "downlink": to_json(downlink)}
-
-    def reset(
-        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
-        """Starts episodes; channels among the options take the place of drawn ones, in these episodes."""
-
-        def source(which: _Which, first: Any) -> Any:
-            return EveryEpisode(partial(self._draw, which), first)
-
-        options = _options(self._keys, self._drawn, options, source)
-        # gymnasium's annotation leaves out the lists that its own vector environments take.
-        return self.env.reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
-
-    def _draw(self, which: _Which, rng: np.random.Generator) -> Any:
-        """Returns what is drawn now, whenever the environments began to ask for it."""
-        return self._drawn[which](rng)
+    _kind, _wrapper = "an NCSVectorEnv or VectorNetworked", VectorWrapper
 
 
-def _keys(channel: Any) -> list[Any]:
-    """Returns the keys of an environment's channels; that of a single one is None."""
-    return list(channel) if isinstance(channel, Mapping) else [None]
-
-
-def _drawn(keys: list[Any], channel: Any, downlink: Any) -> dict[_Which, _Draw]:
-    """Returns what channels are drawn from, by the option of `reset` and the key of a channel."""
-    given: dict[_Which, Any] = {}
+def _drawn(keys: list[Any], channel: Any, downlink: Any) -> dict[tuple[str, Any], Draw]:
+    """Returns what channels are drawn from, by their direction and their key; that of a single channel is None."""
+    given: dict[tuple[str, Any], Any] = {}
     if channel is not None:
         each = channel if isinstance(channel, Mapping) and keys != [None] else dict.fromkeys(keys, channel)
         if unknown := [key for key in each if key not in keys]:
@@ -300,45 +239,20 @@ def _drawn(keys: list[Any], channel: Any, downlink: Any) -> dict[_Which, _Draw]:
         given["downlink", None] = downlink
     if not given:
         raise ValueError("give channel or downlink: a function (rng) -> Channel, or a list of channels")
-    return {
-        (name, key): _draw(source, name, keys if name == "channel" else [None]) for (name, key), source in given.items()
-    }
+    return {which: _draw(source, which[0]) for which, source in given.items()}
 
 
-def _draw(source: Any, name: str, keys: list[Any]) -> _Draw:
-    """Returns what draws a channel, given a function or a list; `keys` are those of the channels in this direction."""
+def _draw(source: Any, name: str) -> Draw:
+    """Returns what draws a channel, given a function or a list."""
     if callable(source):
         return source
     choices = [from_json(each, (Channel,), name) for each in source] if isinstance(source, (list, tuple)) else []
     if not choices or not all(isinstance(each, Channel) for each in choices):
-        by_key = "" if keys == [None] else f", or a dictionary of these by the keys {keys}"
         raise ValueError(
-            f"{name} must be a function (rng) -> Channel or a list of channels{by_key}, got {shown(source)}"
+            f"{name} must be a function (rng) -> Channel or a list of channels, of several channels also a dictionary "
+            f"of these by their keys, got {shown(source)}"
         )
     return partial(_chosen, tuple(choices))
-
-
-def _options(
-    keys: list[Any], drawn: dict[_Which, _Draw], given: dict[str, Any] | None, source: Callable[[_Which, Any], Any]
-) -> dict[str, Any]:
-    """Returns the options of a reset, with what is drawn.
-
-    Args:
-        keys: Of the environment's channels.
-        drawn: What channels are drawn from.
-        given: The options that were given.
-        source: Returns what an environment draws a channel from, and has instead if that is given.
-    """
-    options = dict(given or {})
-    for name in dict.fromkeys(name for name, _ in drawn):
-        own = options.get(name)
-        if name == "downlink" or keys == [None]:
-            options[name] = source((name, None), own)
-        else:
-            each = own if isinstance(own, Mapping) else dict.fromkeys(keys, own)
-            several = {key: source((name, key), each.get(key)) for key in keys if (name, key) in drawn}
-            options[name] = {**each, **several}
-    return options
 
 
 def _chosen(choices: tuple[Channel, ...], rng: np.random.Generator) -> Channel:

@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from ncs_gym.envs.episode_channels import EpisodeChannels
 from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.loop import Loop, LoopState
 from ncs_gym.envs.report import Belief
 from ncs_gym.envs.spaces import actions_of
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.network.channel import Channel, require_on_request
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.contract import ChannelContract, largest_age
 from ncs_gym.network.downlink import DownlinkProtocol, Inputs
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
@@ -42,6 +43,7 @@ class GuardedLoop:
     guard: Any = setting("guard")
 
     np_random: np.random.Generator  # of gymnasium
+    horizon: int
     _now: LoopState
     _task_random: Any = None
     _belief: Belief
@@ -60,6 +62,11 @@ class GuardedLoop:
         if self._guard is not None:
             raise ValueError("the environment has a shield already: leave one out, or make an environment for each")
         self._guard, self._consistent = guard, False
+
+    @property
+    def links(self) -> dict[tuple[str, None], EpisodeChannels]:
+        """The channels of the present episodes, by the name of their option of `reset`."""
+        return self._now.links
 
     @property
     def state(self) -> np.ndarray:
@@ -93,6 +100,19 @@ class GuardedLoop:
         """
         found = require_on_request(self._now.requests).outstanding(self._now.estimator.age)
         return found if found.ndim else found.item()
+
+    @property
+    def request_state(self) -> np.ndarray:
+        """The age of the newest sample used, and `outstanding`, shape (2,) or (N, 2) [steps, samples]."""
+        return np.stack([self._now.estimator.age, self.outstanding], axis=-1)
+
+    @property
+    def request_limits(self) -> np.ndarray:
+        """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
+        input_delay, contract = self.downlink_protocol.input_delay, self.contract
+        oldest = largest_age(contract, self.horizon)
+        newer = oldest if contract else self.channel.longest_delay
+        return np.array([oldest, newer + input_delay], dtype=np.float64).clip(min=1.0)
 
     def _begin_draws_of_task(self, seed: int | None) -> None:
         """Gives the task a generator of its own, so that what it draws changes nothing in the loop."""

@@ -19,12 +19,8 @@ SHARED = (
 def loop_info(report: Report, loop: Loop, actions: tuple[np.ndarray, np.ndarray]) -> dict[str, Any]:
     """Returns `info`, every array a fresh copy; the environment is the first axis of what it holds for many.
 
-    Keys of a feature are there where the loop has it.
-
-    Args:
-        report: What happened.
-        loop: What the loop is made of.
-        actions: Those that stand for the inputs applied and committed, fresh arrays of shape (m,) or (N, m).
+    Keys of a feature are there where the loop has it; `actions` stand for the inputs applied and committed, fresh
+    arrays of shape (m,) or (N, m).
     """
     belief, state = report.belief, report.state
     info = {

@@ -106,12 +106,7 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(value: Any, kinds: tuple[type, ...], name: str) -> Any:
-    """Returns the object whose fields a dictionary holds; a value that is no dictionary as it is.
-
-    Args:
-        value: The value of a setting.
-        kinds: Dataclasses that a dictionary may hold the fields of.
-        name: Name of the setting.
+    """Returns the object of one of some dataclasses whose fields a dictionary holds; any other value as it is.
 
     Raises:
         ValueError: If the dictionary holds the fields of none of them, or of several, or a wrong value.
@@ -133,11 +128,7 @@ def from_json(value: Any, kinds: tuple[type, ...], name: str) -> Any:
 
 
 def read_plant(given: Any) -> Any:
-    """Returns the plant that a document, or the path of a file, stands for; any other value as it is.
-
-    Raises:
-        ValueError: If it is that of no plant.
-    """
+    """Returns the plant that a document, or the path of a file, stands for; any other value as it is."""
     if not isinstance(given, Mapping):
         return LinearPlant.load(given) if isinstance(given, str | os.PathLike) else given
     try:

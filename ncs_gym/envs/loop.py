@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ncs_gym.envs.episode_channels import EpisodeChannels, channel_infos, covering, downlinks, uplinks
-from ncs_gym.envs.loop_settings import CHANNELS, expect, loop_contracts, starting_set
+from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
+from ncs_gym.envs.loop_settings import expect, loop_contracts, starting_set
 from ncs_gym.envs.report import Beginning, Belief, Report
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
@@ -37,9 +36,9 @@ SAMPLE_ROUNDING = 1e-9
 class Loop:
     """What a control loop is made of: a plant, what acts on it and moves, and the networks of both directions.
 
+    The fields are those of `NCSEnv`.
+
     Attributes:
-        plant, channel, disturbance, initial_set, allow_assumption_violation, contract, noise, process, downlink,
-            downlink_contract: As of `NCSEnv`, which checks nothing of them by itself.
         protocol: How commands are sent over the downlink, with its `input_delay`: 0 for an ideal one.
         certificate_contract: Contract that a certificate for this loop rests on: `contract` with c steps added.
         error_set: Certified error set, or sets by age.
@@ -117,13 +116,8 @@ class Loop:
 class LoopState(CopiedWhole, ABC):
     """Where a loop is, or where N are; the last axis of every array is then the loop.
 
-    A loop begins and moves with random numbers of the caller's. What a task draws comes between those of the plant and
-    of the network, which is why tasks are called from here.
-
     Args:
         loop: What it is made of.
-        channels: Those that episodes have unless they are given others, one for each loop; None for those of `loop`.
-        downlinks_own: The downlinks, likewise.
         size: N; None for one loop, whose values are numbers in place of arrays.
 
     Attributes:
@@ -134,52 +128,45 @@ class LoopState(CopiedWhole, ABC):
         start: What the start of the episode is known to lie in, for one loop; for N, states that episodes were started
             at by an option or outside the initial set, NaN elsewhere, shape (N, n).
         channels, downlinks: Those of the present episodes.
+        links: Both, by the name of their option of `reset`, and None for the key that channels of several parts have.
     """
 
-    def __init__(
-        self,
-        loop: Loop,
-        channels: Sequence[Channel] | None = None,
-        downlinks_own: Sequence[Channel | None] | None = None,
-        size: int | None = None,
-    ) -> None:
+    def __init__(self, loop: Loop, size: int | None = None) -> None:
         plant, count = loop.plant, size or 1
         self.loop, self._size = loop, size
         allowed = loop.allow_assumption_violation
         self.process = PlantSimulation(plant, loop.disturbance, allowed, size, noise=loop.noise, process=loop.process)
-        self.channels = uplinks(channels or [loop.channel] * count, loop.channel, plant.dt)
-        self.downlinks = downlinks(downlinks_own or [loop.downlink] * count, loop.protocol, plant.dt)
+        self.channels = uplinks(loop.channel, plant.dt, count)
+        self.downlinks = downlinks(loop.downlink, loop.protocol, plant.dt, count)
+        self.links = {("channel", None): self.channels, ("downlink", None): self.downlinks}
         self.requests = None
         if loop.channel.on_request:
             self.requests = Requests(loop.channel, loop.contract, loop.protocol.input_delay, size)
         self._others: dict[str, Any] = {}
 
-    @property
-    def links(self) -> dict[str, EpisodeChannels]:
-        """The channels of both directions, by the name of their option of `reset`."""
-        return dict(zip(CHANNELS, (self.channels, self.downlinks), strict=True))
-
     def read(self, options: dict[str, Any] | None) -> tuple[list[Any], np.ndarray | None]:
         """Returns what options of `reset` say of channels and of parameters; raises ValueError if one is wrong."""
         given = options or {}
-        sources = [links.read(given.get(name), name) for name, links in self.links.items()]
+        sources = [links.read(given.get(name), name) for (name, _), links in self.links.items()]
         return sources, self.process.read_parameters(given.get("parameters"))
 
-    def drawn(self, sources: list[Any], rng: np.random.Generator, chosen: Sequence[int] | None = None) -> list[Any]:
+    def drawn(self, sources: list[Any], rng: np.random.Generator, chosen: list[int] | None = None) -> list[Any]:
         """Returns sources in which those that draw have drawn; nothing has changed where that fails."""
         return [links.drawn(each, rng, chosen) for links, each in zip(self.links.values(), sources, strict=True)]
 
-    def give(self, sources: list[Any], chosen: Sequence[int] | None = None) -> None:
+    def give(self, sources: list[Any], chosen: list[int] | None = None) -> None:
         """Gives the next episodes of some loops, all by default, the channels of sources."""
         for links, each in zip(self.links.values(), sources, strict=True):
             links.give(each, chosen)
 
+    def _channel_infos(self) -> dict[str, Any]:
+        many = self._size is not None
+        return self.channels.infos("channel", many=many) | self.downlinks.infos("downlink", many=many)
+
     def move(self, rng: np.random.Generator, u: np.ndarray) -> tuple[Inputs, Any]:
         """Moves one step on; returns the inputs of the step, and whether a packet arrived, a bool or shape (N,).
 
-        Args:
-            rng: Source of randomness.
-            u: What is decided now, shape (m,) or (m, N) [physical units].
+        What is decided now is `u`, shape (m,) or (m, N) [physical units].
         """
         self.moves = self.moves + 1
         inputs = self.downlink.exchange(rng, self.steps, u)
@@ -257,11 +244,7 @@ class LoopState(CopiedWhole, ABC):
 
 
 class OneLoop(LoopState):
-    """Where one loop is.
-
-    Attributes:
-        received: The packets that arrived at the last step.
-    """
+    """Where one loop is; `received` are the packets that arrived at the last step."""
 
     def __init__(self, loop: Loop) -> None:
         super().__init__(loop)
@@ -271,26 +254,16 @@ class OneLoop(LoopState):
         self.start = loop.initial_set
         self.received: list[Any] = []
 
-    def begin(
-        self,
-        rng: np.random.Generator,
-        start: np.ndarray | None,
-        fixed: np.ndarray | None,
-    ) -> None:
-        """Begins an episode.
-
-        Args:
-            rng: Source of randomness.
-            start: Where, shape (n,); None draws it from the initial set.
-            fixed: What `read` returned of parameters.
-        """
+    def begin(self, rng: np.random.Generator, start: np.ndarray | None, fixed: np.ndarray | None) -> None:
+        """Begins an episode at a state, (n,), or a drawn one; `fixed` is what `read` returned of parameters."""
         loop, self.moves = self.loop, self.moves + 1
-        initial, first = (None, start) if start is not None else (loop.initial_set, self._drawn_start(rng))
+        initial = loop.initial_set if start is None else None
+        first = (1.0 - SAMPLE_ROUNDING) * loop.initial_set.sample(rng) if start is None else start
         self.state, self.start = self.process.start(rng, first, initial, fixed)
         self.memory = self.process.begin(rng)
         for links in self.links.values():
             links.begin(rng)
-        self._others = channel_infos(self.channels, self.downlinks)
+        self._others = self._channel_infos()
         channel = self.channels.now[0]
         self.network, self.packets = ChannelState(channel, rng), 0
         if self.requests is not None:
@@ -303,9 +276,6 @@ class OneLoop(LoopState):
         self.steps, self.violations, self.received = 0, 0.0, []
         self.episodes += 1
         self.worst = loop.plant.values_at_start(self.state)
-
-    def _drawn_start(self, rng: np.random.Generator) -> np.ndarray:
-        return (1.0 - SAMPLE_ROUNDING) * self.loop.initial_set.sample(rng)
 
     def _receive(self, rng: np.random.Generator, u: np.ndarray, requested: Any) -> bool:
         if requested is not None:
@@ -321,14 +291,8 @@ class OneLoop(LoopState):
 class ManyLoops(LoopState):
     """Where N loops are, each in an episode of its own."""
 
-    def __init__(
-        self,
-        loop: Loop,
-        size: int,
-        channels: Sequence[Channel] | None = None,
-        downlinks_own: Sequence[Channel | None] | None = None,
-    ) -> None:
-        super().__init__(loop, channels, downlinks_own, size)
+    def __init__(self, loop: Loop, size: int) -> None:
+        super().__init__(loop, size)
         plant, self.size = loop.plant, size
         self.estimator = VectorEstimator(plant, loop.histories(loop.channel), size)
         self.downlink = VectorDownlinkState(loop.protocol, plant.m, size)
@@ -339,20 +303,9 @@ class ManyLoops(LoopState):
         self.worst = plant.values_at_start(self.state)
 
     def begin(
-        self,
-        rng: np.random.Generator,
-        mask: np.ndarray,
-        starts: np.ndarray | None,
-        fixed: np.ndarray | None,
+        self, rng: np.random.Generator, mask: np.ndarray, starts: np.ndarray | None, fixed: np.ndarray | None
     ) -> None:
-        """Begins episodes where `mask`, shape (N,), says so.
-
-        Args:
-            rng: Source of randomness.
-            mask: Where.
-            starts: The states, shape (N, n); None draws them from the initial set.
-            fixed: What `read` returned of parameters.
-        """
+        """Begins episodes where a mask, (N,), says so, at states, (N, n), or drawn ones; for `fixed` see `read`."""
         loop, rows, self.moves = self.loop, np.flatnonzero(mask), self.moves + mask
         count = len(rows)
         first_states = ((1.0 - SAMPLE_ROUNDING) * loop.initial_set.sample(rng, count)).T
@@ -362,7 +315,7 @@ class ManyLoops(LoopState):
         memory = self.process.begin(rng, count)
         channels, commands = self.channels.begin(rng, rows), self.downlinks.begin(rng, rows)
         if count == self.size or not (self.channels.is_plain and self.downlinks.is_plain):
-            self._others = channel_infos(self.channels, self.downlinks, many=True)
+            self._others = self._channel_infos()
         if count == self.size:
             self.memory = np.array(memory)
             self.network = VectorChannelState(channels or loop.channel, rng, count)

@@ -30,8 +30,6 @@ def loop_contracts(
 ) -> tuple[ChannelContract | None, DownlinkProtocol, ChannelContract | None]:
     """Returns the contract of the uplink, the protocol of the downlink and the contract of a certificate for both.
 
-    The certificate's also counts the steps between a decision and its effect.
-
     Raises:
         UnstablePlantError: If an unstable plant has neither a contract nor a channel that keeps one.
         ValueError: If the channel rounds more coarsely than the contract allows, or a setting is wrong.
@@ -90,22 +88,14 @@ def require_suitable(task: Task, plant: LinearPlant) -> None:
 
 
 def expect(value: Any, kind: type[T], name: str) -> T:
-    """Returns a setting that is of the right kind.
-
-    Raises:
-        ValueError: If it is not.
-    """
+    """Returns a setting that is of the right kind; raises ValueError if it is not."""
     if not isinstance(value, kind):
         raise ValueError(f"{name} must be of type {kind.__name__}, got {type(value).__name__}")
     return value
 
 
 def start_option(options: dict[str, Any] | None, plant: LinearPlant) -> np.ndarray | None:
-    """Returns options["state"] as a finite array of shape (n,), or None without one.
-
-    Raises:
-        ValueError: If an option is unknown, has a wrong shape or is not finite.
-    """
+    """Returns options["state"] as a finite array of shape (n,), or None without one; raises ValueError if wrong."""
     options = _known_options(options, {"state", "parameters", *CHANNELS})
     if "state" not in options:
         return None

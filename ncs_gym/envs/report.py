@@ -24,8 +24,8 @@ class Belief(NamedTuple):
         table: What gives that number its meaning; another one after shapes were forgotten.
         age: Steps since the newest sample used was taken, an int or shape (N,).
         alarm: Whether an assumption was seen to be violated, a bool or shape (N,).
-        damaged: Whether one was because a sample was no finite numbers, a bool or shape (N,).
-        outside: Whether `alarm` is also about a step of the process outside E(D), a bool or shape (N,).
+        damaged: Whether one was because a sample was no finite numbers, likewise.
+        outside: Whether `alarm` is also about a step of the process outside E(D), likewise.
         applied: The input applied in the last step, shape (m,) or (m, N) [physical units]; zeros at a reset.
         committed: The input decided in the last step, of the same shape.
         moves: Steps and resets of this loop since it was made, an int or shape (N,): the one clock.
@@ -98,9 +98,9 @@ class Report(NamedTuple):
         values: How far c_j x is beyond a limit now, shape (k,) or (k, N).
         worst: The largest since the last step, and those of limits of x and u, shape (k + q,) or (k + q, N).
         cost: 1.0 if one of these is positive, else 0.0, a float or shape (N,).
-        violations: The sum of costs in the episode, a float or shape (N,).
+        violations: The sum of costs in the episode, likewise.
         missing: Whether zero was applied because the input committed had not arrived, a bool or shape (N,).
-        requested: Whether a sample was requested, a bool or shape (N,).
+        requested: Whether a sample was requested, likewise.
         forced: Whether that was so only because the contract needs it, likewise.
         others: Infos about the episode: its channels, the parameters of the member of a family.
     """

@@ -47,12 +47,11 @@ def observation_space(
         error_set: Bounds the errors.
         initial_set: Bounds the starts.
         horizon: Number of steps.
-        input_delay: c, the number of steps from a decision to its effect, of which observations tell.
+        input_delay: c, the number of steps from a decision to its effect.
         observe: What is observed besides; see `read_observed`.
 
     Raises:
-        ValueError: If a bound of the task is no number > 0, or an entry is beyond float32's range, so that observations
-            would be infinite, or always zero.
+        ValueError: If a bound of the task is no number > 0, or an entry is beyond float32's range.
     """
     powers = [np.eye(plant.n)]
     for _ in range(horizon):
@@ -97,12 +96,7 @@ def read_observed(observe: Any) -> tuple[str, ...]:
 
 
 def nearest_action(inputs: np.ndarray, plant: LinearPlant) -> np.ndarray:
-    """Returns the float32 actions whose inputs are nearest to some, clipped to [-1, 1].
-
-    Args:
-        inputs: Shape (..., m) [physical units].
-        plant: Gives the limits: -1 stands for the low end of an input, 1 for the high one.
-    """
+    """Returns the float32 actions whose inputs are nearest to some, shape (..., m), clipped to [-1, 1]."""
     if inputs.ndim == 1:  # of one environment, in a fifth of the time
         each = zip(inputs.tolist(), plant.input_middle.tolist(), plant.input_half.tolist(), strict=True)
         scaled = [(u - middle) / half for u, middle, half in each]
@@ -116,10 +110,7 @@ def actions_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the float32 actions that stand for the inputs applied and committed, shape (m,) or (N, m) each.
 
-    Args:
-        inputs: Applied and committed.
-        plant: Gives the limits.
-        read: What `read_action` returned, if that was decided: the action may be the one that is asked for.
+    If what `read_action` returned was decided, the action is the one that was given.
     """
     if read is not None and inputs.committed is inputs.applied is read[1] and read[0].dtype.char == "f":
         return read[0], read[0].copy()
@@ -135,14 +126,14 @@ def expressible(inputs: np.ndarray, plant: LinearPlant) -> np.ndarray:
 
 
 class Observer:
-    """Makes the observations of a control loop, or of N at once.
+    """Makes the observations of a control loop, or of N at once, the last axis.
 
     Args:
         task: The task, which has entries of its own.
         space: The observation space of one loop.
         observe: What is observed besides; see `read_observed`.
         horizon: Steps that the bounds of the space are about.
-        many: Whether arrays have an axis for the environments, the last one.
+        many: Whether there are N.
     """
 
     def __init__(self, task: Task, space: Box, observe: tuple[str, ...], horizon: int, *, many: bool = False) -> None:
@@ -154,9 +145,7 @@ class Observer:
     def observation(self, known: Belief, own: Any) -> np.ndarray:
         """Returns entries clipped to the space, shape (entries,) or (entries, N), float32.
 
-        Args:
-            known: What is known now.
-            own: The task's entries, shape (extra,) or (extra, N).
+        The task's own are of shape (extra,) or (extra, N).
 
         Raises:
             ValueError: If the task has another number of entries than it has bounds.
@@ -201,7 +190,7 @@ class Observer:
 
 
 def read_action(plant: LinearPlant, action: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Reads an action, once: whoever writes into it later, or makes numbers of it anew, changes nothing any more.
+    """Reads an action once, so that nobody who writes into it later changes anything.
 
     Returns:
         A copy of the action, float32 if it is an array of that and float64 otherwise, clipped to [-1, 1], and the

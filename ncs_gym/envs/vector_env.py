@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -11,23 +10,23 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.autoreset import Autoreset, Begun, Moved
-from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv, note_of
+from ncs_gym.envs.env import DEFAULT_HORIZON, LONGEST_HORIZON, NCSEnv, RenderModeError
 from ncs_gym.envs.guarded_loop import GuardedLoop
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import ManyLoops, with_columns
-from ncs_gym.envs.loop_settings import CHANNELS, vector_reset_options
+from ncs_gym.envs.loop_settings import vector_reset_options
 from ncs_gym.envs.spaces import Observer, read_actions
-from ncs_gym.network.channel import Channel, widest
+from ncs_gym.network.channel import Channel
 from ncs_gym.network.downlink import no_inputs
 from ncs_gym.tasks.base_task import Task
-from ncs_gym.validation import as_count, setting, shown
+from ncs_gym.validation import as_count, setting
 
 
 class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
     """N copies of `NCSEnv` with the same semantics, spaces and info keys; every info value has N as its first axis.
 
-    Inside, the environment is the last axis, so that A x + B u stands as in the formulas. What depends only on when
-    packets arrive is looked up (`ArrivalHistories`); it is worked out when a history occurs for the first time.
+    Inside, the environment is the last axis, so that A x + B u stands as in the formulas. Pictures are drawn of single
+    environments alone.
 
     Args:
         num_envs: N.
@@ -36,16 +35,11 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         autoreset_mode: `AutoresetMode.NEXT_STEP` or "NextStep" (the step after an episode's last ignores the action
             and returns the new episode's first observation), "SameStep" (`final_obs` and `final_info` hold the last
             ones) or "Disabled" (reset with `options={"reset_mask": ...}`).
-        channel: A channel, or a list of N, one for each environment; likewise `downlink`. `channel`, `downlink` and by
-            default the contract are then those of the widest of them (`ncs_gym.network.channel.widest`).
-        downlink: See `channel`.
-        rendered_env: Number of the environment that is drawn, with a `render_mode`.
-        settings: The others of `NCSEnv`.
+        settings: Those of `NCSEnv` but `render_mode`.
 
     Attributes:
-        episode_channels: The channels of the present episodes, N of them; those the environments were made with unless
-            options of a reset gave others.
-        episode_downlinks: The downlinks, likewise.
+        episode_channels: The channels of the present episodes, N of them.
+        episode_downlinks: The downlinks, likewise; None for ideal ones.
         single: The scalar environment with these settings; never stepped.
         steps: Steps taken in each episode, shape (N,).
         episodes: Episodes begun in each environment, shape (N,).
@@ -55,6 +49,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         ValueError: If a setting is wrong; see `NCSEnv`.
     """
 
+    metadata = NCSEnv.metadata | {"render_modes": []}
     single: NCSEnv = setting("single")
     _now: ManyLoops
     task: Task = setting("task")
@@ -73,39 +68,35 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         *,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        channel: Channel | Sequence[Channel] | None = None,
-        downlink: Channel | Sequence[Channel] | None = None,
-        rendered_env: int = 0,
         **settings: Any,
     ) -> None:
         self.num_envs = as_count(num_envs, "num_envs", low=1)
         limit = None if type(max_episode_steps) is int and max_episode_steps == -1 else max_episode_steps
         self._max_episode_steps = None if limit is None else as_count(limit, "max_episode_steps", low=1)
         self._autoreset = Autoreset(autoreset_mode, self.num_envs)
-        self.metadata = NCSEnv.metadata | {"autoreset_mode": self._autoreset.mode}
-        self.rendered_env = as_count(rendered_env, "rendered_env", low=0, high=self.num_envs - 1)
-        own = [self._one_each(each, name) for name, each in zip(CHANNELS, (channel, downlink), strict=True)]
+        self.metadata = self.metadata | {"autoreset_mode": self._autoreset.mode}
+        if settings.get("render_mode") is not None:
+            raise RenderModeError("pictures are drawn of single environments: gym.make(id, render_mode=...)")
         if self._max_episode_steps is not None:
             own_horizon = as_count(settings.get("horizon", DEFAULT_HORIZON), "horizon", low=1, high=LONGEST_HORIZON)
             settings["horizon"] = max(own_horizon, min(self._max_episode_steps, LONGEST_HORIZON))
-        settings |= {name: each and widest(each) for name, each in zip(CHANNELS, own, strict=True)}
         self._single = single = NCSEnv(**settings)
-        self._task, self.render_mode = single.task, single.render_mode
+        self._task = single.task
         self.single_observation_space = single.observation_space
         self.single_action_space = single.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._observer = Observer(self._task, single.observation_space, single.observe, single.horizon, many=True)
-        self._now = ManyLoops(single.loop, self.num_envs, *own)
+        self._now = ManyLoops(single.loop, self.num_envs)
 
     @property
     def episode_channels(self) -> tuple[Channel, ...]:
-        """The channels of the present episodes."""
+        """See the class."""
         return tuple(self._now.channels.now)
 
     @property
     def episode_downlinks(self) -> tuple[Channel | None, ...]:
-        """The downlinks of the present episodes; None for ideal ones."""
+        """See the class."""
         return tuple(self._now.downlinks.now)
 
     def reset(
@@ -117,8 +108,8 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
             seed: Seeds `np_random`, the only source of randomness of all environments.
             options: {"state": x0} starts at x0, shape (n,) or (N, n); {"reset_mask": (N,)} says which environments.
                 {"channel": c}, {"downlink": c} give these environments other channels, one for all or a list of N, in
-                which None stands for an environment's own; see `NCSEnv.reset`. They are for these episodes; those that
-                begin by themselves have the environments' own again (`VectorRandomChannel` draws for every episode).
+                which None stands for an environment's own; see `NCSEnv.reset`. Episodes that begin by themselves have
+                the environments' own again (`VectorRandomChannel` draws for every episode).
                 {"parameters": {name: value}} fixes parameters of these episodes, each a number or shape (N,).
 
         Raises:
@@ -144,7 +135,6 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         observation, info = self._begin(mask, starts, fixed)
         self._autoreset.over = self._autoreset.over & ~mask
         self._consistent = True
-        self._draw(info, begins=mask, moved=False)
         if self._guard is not None:
             self._guard.lost.tell()
         return observation, info
@@ -164,7 +154,6 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         self._consistent = False
         moved = self._autoreset.step(lambda: self._move(u), self._begin)
         self._consistent = True
-        self._draw(moved[-1], begins=self._autoreset.begun)
         if self._guard is not None:
             self._guard.lost.tell()
         return moved
@@ -193,10 +182,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         return self._observation(), reward, terminated, truncated, info
 
     def _begin(self, mask: np.ndarray, starts: np.ndarray | None = None, fixed: np.ndarray | None = None) -> Begun:
-        """Begins episodes where `mask` (N,) says so, at `starts` (N, n) or drawn from the initial set.
-
-        `fixed` is what the process read of the parameters of a family, (N, k).
-        """
+        """Begins episodes; see `ManyLoops.begin`."""
         now = self._now
         now.begin(self.np_random, mask, starts, fixed)
         begun = self._task.begin_many(self._task_random, self.plant, int(np.count_nonzero(mask)))
@@ -206,31 +192,6 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
             self._guard.begin(now.beginning(self._belief, np.flatnonzero(mask)), mask)
             info |= self._guard.info()
         return self._observation(), info
-
-    def render(self) -> tuple[np.ndarray, ...] | None:
-        """Returns the picture of `rendered_env` for each environment (`RecordVideo(record_first_only=True)`).
-
-        Raises:
-            gymnasium.error.ResetNeeded: If there was no reset.
-        """
-        if self._single.renderer is None or not self._consistent:
-            self._single.render()  # says what is missing
-            return None
-        picture = self._single.renderer.render()
-        return None if picture is None else (picture,) * self.num_envs
-
-    def _draw(self, info: dict[str, Any], begins: np.ndarray, *, moved: bool = True) -> None:
-        renderer, e = self._single.renderer, self.rendered_env
-        if renderer is None:
-            return
-        own = {key: value[e] for key, value in info.items() if not key.startswith(("_", "final"))}
-        task_state, note = np.copy(self._task_state[..., e])[()], note_of(self._guard, own, e)
-        if begins[e]:
-            renderer.begin(own, task_state, note)
-        elif moved:
-            step = int(self.steps[e])
-            sends, arrival = self._now.network.arrival_of(e, step)
-            renderer.record(own, task_state, (step, arrival) if sends else None, note)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Closes the process."""
@@ -244,17 +205,6 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
             ValueError: If one is not finite or the shape is wrong.
         """
         return read_actions(self.plant, actions, self.num_envs)[1]
-
-    def _one_each(self, value: Any, name: str) -> list[Channel] | None:
-        """Returns a channel that is given for all environments, or for each, as a list of N; None for None."""
-        if value is None:
-            return None
-        each = list(value) if isinstance(value, (list, tuple)) else [value] * self.num_envs
-        if len(each) != self.num_envs or not all(isinstance(channel, Channel) for channel in each):
-            raise ValueError(
-                f"{name} must be of type Channel, or a list of {self.num_envs} of these, got {shown(value)}"
-            )
-        return each
 
     def _observation(self) -> np.ndarray:
         task_state = self._task_state

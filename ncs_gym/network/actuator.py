@@ -50,7 +50,7 @@ class Echo(NamedTuple):
 
 
 def digest_of_inputs(before: bytes, u: np.ndarray | None) -> bytes:
-    """Returns 16 bytes that stand for all inputs of an episode so far, given those for all but the last one, (m,).
+    """Returns 16 bytes that stand for all inputs of an episode so far, (m,) each.
 
     Args:
         before: The digest before this step; `NO_INPUTS` at the start.
@@ -63,9 +63,8 @@ class Actuator(CopiedWhole):
     """Applies at each step the input that was committed for it, or zero if no command with it has arrived.
 
     Commands may be lost, late, early, duplicated or overtake each other: what is committed for a step is the same in
-    each command that holds it, so that the first to arrive is enough. The first c inputs of an episode are zero by
-    agreement. What cannot be true is refused: a command stamped far ahead of the step that comes next, or with an input
-    beyond the limits.
+    each command that holds it. The first c inputs of an episode are zero by agreement. A command stamped far ahead of
+    the step that comes next, or with an input beyond the limits, is refused.
 
     Args:
         input_delay: c, the number of steps from a decision to its effect.
@@ -99,11 +98,7 @@ class Actuator(CopiedWhole):
         self.start()
 
     def start(self, episode: int = 0) -> None:
-        """Starts an episode at step 0: commands of any other are discarded from now on.
-
-        Raises:
-            ValueError: If the number of the episode is no whole number from 0 on.
-        """
+        """Starts an episode at step 0: commands of any other are discarded from now on."""
         self.echo = Echo(0, 0, NO_INPUTS, as_count(episode, "episode", low=0))
         self._committed: dict[int, np.ndarray] = {}
         self._requested: dict[int, bool] = {}
@@ -173,7 +168,6 @@ class Actuator(CopiedWhole):
 
 
 def _as_command(value: Any, shape: tuple[int, int]) -> Command:
-    """Returns a command whose inputs have a shape, (c+1, m)."""
     stamp = episode = 0
     requests: tuple[bool, ...] = ()
     try:
@@ -192,11 +186,7 @@ def _as_command(value: Any, shape: tuple[int, int]) -> Command:
 
 
 def as_echo(value: Any) -> Echo:
-    """Returns an echo.
-
-    Raises:
-        ValueError: If it is none.
-    """
+    """Returns an echo; raises ValueError for what is none."""
     try:
         steps, missing, digest, episode = value
         if isinstance(digest, bytes):
@@ -207,14 +197,11 @@ def as_echo(value: Any) -> Echo:
 
 
 class CommittedInputs:
-    """The inputs decided for the next c steps, the earliest first; once an input is among them, it is never changed.
+    """The inputs decided for the next c steps, `pending`, the earliest first; none of them is ever changed.
 
     Args:
         input_delay: c, the number of steps from a decision to its effect.
         shape: Of an input: m, or (m, N) for N environments.
-
-    Attributes:
-        pending: These inputs.
     """
 
     def __init__(self, input_delay: int, shape: int | tuple[int, int]) -> None:
@@ -222,10 +209,7 @@ class CommittedInputs:
         self.start()
 
     def start(self, chosen: np.ndarray | None = None) -> None:
-        """Starts an episode, in all environments or in those of a mask (N,): the inputs of its first c steps are zero.
-
-        In all of them, whatever interrupted the last step leaves nothing behind.
-        """
+        """Starts an episode, in all environments or in those of a mask (N,); its first c inputs are zero."""
         if chosen is None or chosen.all():
             self.pending: tuple[np.ndarray, ...] = (self._nothing,) * self._input_delay
         else:
@@ -236,7 +220,7 @@ class CommittedInputs:
         self.pending = (*self.pending, np.array(u, dtype=np.float64))
 
     def command(self, step: int, episode: int, requests: tuple[bool, ...] = ()) -> Command:
-        """Returns the command to send at a step, after the commitment of that step, with requests if there are any."""
+        """Returns the command to send at a step, after the commitment of that step."""
         return Command(step, np.array(self.pending), episode, requests)
 
     def pop(self) -> np.ndarray:

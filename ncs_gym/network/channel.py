@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, fields, replace
+from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
-from math import inf, isclose
+from math import isclose
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,8 +25,7 @@ class Packet(NamedTuple):
     Attributes:
         stamp: Step at which the sample was taken, counted from the start of its episode.
         measurement: The (quantized) measurement, shape (p,).
-        episode: Number of that episode, counted from 0: stamps begin anew in each, so that an estimator discards
-            packets of any episode but its own (`Estimator.episode`).
+        episode: Number of that episode, counted from 0; an estimator discards packets of any but its own.
     """
 
     stamp: int
@@ -190,20 +188,6 @@ class Channel:
         return np.rint(measurement / q) * q if q > 0.0 else measurement
 
 
-def widest(channels: Sequence[Channel]) -> Channel:
-    """Returns the channel whose samples become the oldest, with the coarsest quantization step of all.
-
-    One that promises nothing is wider than any that does; among equals it is the one with the longest delay.
-    """
-
-    def oldest(channel: Channel) -> tuple[float, int]:
-        age = channel.oldest_age
-        return inf if age is None else age, channel.longest_delay
-
-    coarsest = max(channel.quantization_step for channel in channels)
-    return replace(max(channels, key=oldest), quantization_step=coarsest)
-
-
 def _chain(bursts: GilbertElliott, period: int) -> np.ndarray:
     """Returns the transition matrix of bursts from one packet to the next, shape (2, 2)."""
     good, bad = bursts.p_good_to_bad, bursts.p_bad_to_good
@@ -213,8 +197,8 @@ def _chain(bursts: GilbertElliott, period: int) -> np.ndarray:
 def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
     """Returns the long-run share of packets that are lost, of one every so many steps and at most `most` in a row.
 
-    It is that of a cycle from one arrival to the next. With M the chain from one packet to the next and N its part with
-    a loss, a cycle that begins in the states a has on average a (1 + N + .. + N^most) 1 packets, one of which arrives.
+    With M the chain from one packet to the next and N its part with a loss, a cycle from one arrival to the next that
+    begins in the states a has on average a (1 + N + .. + N^most) 1 packets, one of which arrives.
     """
     M = _chain(bursts, period)
     N = M * [bursts.loss_good, bursts.loss_bad]
@@ -228,11 +212,7 @@ def _mean_loss(bursts: GilbertElliott, period: int, most: int) -> float:
 
 
 def require_on_request(requests: Any) -> Any:
-    """Returns the requests of a channel that takes samples on request.
-
-    Raises:
-        ValueError: If there are none: then samples are sent periodically.
-    """
+    """Returns the requests of a channel that takes samples on request; raises ValueError if there are none."""
     if requests is None:
         raise ValueError("the channel sends samples by itself: make it with Channel(..., on_request=True)")
     return requests
@@ -255,7 +235,6 @@ def in_time(seconds: float) -> str:
 
 
 def _bursts(loss: dict[str, Any]) -> GilbertElliott:
-    """Returns the bursty loss whose fields a dictionary holds, as `dataclasses.asdict` leaves one."""
     try:
         return GilbertElliott(**loss)
     except TypeError:
@@ -270,9 +249,9 @@ class TraceChannel(Channel):
     """A channel that replays what happened to the samples of a record, from a random one on and around again.
 
     `PacketLog.channel` makes one of recorded packets. Every `send_period` steps the next entry of the trace is what
-    happens to the sample of that step; an entry where nothing was sent is that of a lost packet. The contract of the
-    channel is the largest age of the replay (`oldest_age`). On request (`on_request`) the next entry is that of the
-    next sample that is asked for, so that an outage does not end before as many samples are lost as in the record.
+    happens to the sample of that step; where nothing was sent it is lost. The contract of the channel is the largest
+    age of the replay (`oldest_age`). On request (`on_request`) the next entry is that of the next sample that is asked
+    for, so that an outage does not end before as many samples are lost as in the record.
 
     Attributes:
         trace: After how many steps each sample arrived, one after the other; -1 for one that was lost, or never sent.
@@ -337,23 +316,12 @@ class TraceChannel(Channel):
     def oldest_age(self) -> int | None:
         """The largest age of the newest sample in a replay without end [steps]; None if nothing arrives.
 
-        On request the limit is that of the longest run of losses and the longest delay, as of every channel.
+        On request the limit is that of the longest run of losses and the longest delay.
         """
         if self.on_request or self.max_consecutive_losses is None:
             return super().oldest_age
-        return int(self._replay().max())
-
-    @property
-    def usual_age(self) -> int:
-        """An age that the newest sample exceeds in at most `UNUSUAL` of the steps of a replay [steps]."""
-        if self.on_request or self.oldest_age is None:
-            return super().usual_age
-        return int(np.quantile(self._replay(), 1.0 - UNUSUAL, method="higher"))
-
-    def _replay(self) -> np.ndarray:
-        """Returns the ages of the newest sample of a replay that goes around twice, shape (steps,) [steps]."""
-        around = len(self.trace) * self.send_period
-        return replayed_ages(self.delays, self.send_period, 2 * around + self.longest_delay)
+        twice = 2 * len(self.trace) * self.send_period + self.longest_delay
+        return int(replayed_ages(self.delays, self.send_period, twice).max())
 
     @property
     def description(self) -> str:
@@ -366,8 +334,7 @@ class TraceChannel(Channel):
 def replayed_ages(trace: np.ndarray, send_period: int, steps: int) -> np.ndarray:
     """Returns the age of the newest sample that has arrived at every step of a replay, shape (steps,) [steps].
 
-    The replay begins with the first sample of the trace at step 0, where the first estimate counts as a sample, and
-    begins anew when the trace is over.
+    The replay begins with the first sample of the trace at step 0, where the first estimate counts as a sample.
 
     Args:
         trace: After how many steps each sample arrives, -1 for a lost one, shape (k,).

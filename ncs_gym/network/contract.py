@@ -56,10 +56,7 @@ class ChannelContract:
 
 
 def contract_of(channel: Channel) -> ChannelContract | None:
-    """Returns the contract a channel keeps by its settings, that of its `oldest_age`.
-
-    None if it may lose for ever, or for so long that it is as good as that.
-    """
+    """Returns the contract that a channel keeps by its settings; None if its age has no limit or exceeds `MAX_AGE`."""
     age = channel.oldest_age
     return None if age is None or age > MAX_AGE else ChannelContract(age, channel.quantization_step)
 
@@ -90,9 +87,8 @@ def warn_of_broken_contract(
         contract: That of the certificate; None for none.
         channel: The channel of the samples.
         input_delay: c, the number of steps from a decision to its effect.
-        counts_losses: Whether losses and jitter count, as of a real channel; one that may lose any number of packets
-            in a row promises nothing. Without them it is warned only of what breaks the contract although no packet is
-            lost, rounding included.
+        counts_losses: Whether losses and jitter count, as of a real channel. Without them it is warned only of what
+            breaks the contract although no packet is lost, rounding included.
     """
     if contract is None:
         return

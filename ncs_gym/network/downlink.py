@@ -1,8 +1,4 @@
-"""The network between controller and actuator: inputs are committed ahead, so that lost commands change nothing.
-
-At step k the controller decides the input of step k + c, and sends those of k .. k + c (docs/contracts.md, "Both
-directions").
-"""
+"""The network between controller and actuator: inputs are committed ahead, so that lost commands change nothing."""
 
 from __future__ import annotations
 
@@ -37,9 +33,9 @@ class DownlinkProtocol:
     contract: ChannelContract | None
 
     def behind(self, contract: ChannelContract | None) -> ChannelContract | None:
-        """Returns the contract that a certificate for this protocol rests on, given that of the uplink.
+        """Returns the contract that a certificate for this protocol rests on, given that of the uplink; None for None.
 
-        When an input takes effect, the newest sample that it was decided with is up to c steps older. None for None.
+        When an input takes effect, the newest sample that it was decided with is up to c steps older.
 
         Raises:
             ValueError: If that is older than contracts can be.
@@ -58,8 +54,8 @@ IDEAL_DOWNLINK = DownlinkProtocol(None, 0, ChannelContract(0))
 def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None) -> DownlinkProtocol:
     """Returns the protocol for a downlink.
 
-    Without a contract, given or by the channel's own settings, inputs are committed ahead for the longest delay only:
-    that can be simulated, but nothing is guaranteed.
+    Without a contract, given or by the channel's own settings, inputs are committed ahead for the longest delay only,
+    and nothing is guaranteed.
 
     Args:
         downlink: The channel for the commands; None for an ideal downlink.
@@ -99,12 +95,7 @@ def downlink_protocol(downlink: Channel | None, contract: ChannelContract | None
 
 
 def require_fitting_downlink(protocol: DownlinkProtocol, downlink: Channel) -> None:
-    """Raises unless a downlink may take the place of that of a protocol, whose c stays; it may break the contract.
-
-    Raises:
-        ValueError: If there is no downlink to take the place of, or what is given is none, or delays commands by more
-            than c steps.
-    """
+    """Raises ValueError unless a downlink may take the place of that of a protocol, whose c stays."""
     if protocol.channel is None:
         raise ValueError(
             "the environment has an ideal downlink, and commits no inputs ahead: make it with downlink=Channel(...)"
@@ -141,7 +132,6 @@ class DownlinkState:
 
     Attributes:
         committed: The inputs decided and not yet applied.
-        in_flight: The channel and the commands on their way.
     """
 
     def __init__(self, protocol: DownlinkProtocol, inputs: int) -> None:
@@ -173,14 +163,6 @@ class VectorDownlinkState:
     """What `DownlinkState` is, for N environments, the last axis of every array.
 
     Every command holds the committed inputs of its c steps unchanged: which one is the newest is all that matters.
-
-    Args:
-        protocol: The channel, and how far ahead inputs are committed.
-        inputs: m.
-        size: N.
-
-    Attributes:
-        committed: The inputs decided and not yet applied.
     """
 
     def __init__(self, protocol: DownlinkProtocol, inputs: int, size: int) -> None:
@@ -190,13 +172,7 @@ class VectorDownlinkState:
         self._channel_state: VectorChannelState
 
     def begin(self, rng: np.random.Generator, chosen: np.ndarray, channels: Sequence[Channel] | None = None) -> None:
-        """Starts episodes in some environments, given by a mask of shape (N,).
-
-        Args:
-            rng: Source of randomness.
-            chosen: The mask.
-            channels: Those of all N environments from now on, the others' being as before; None for all as before.
-        """
+        """Starts episodes where a mask (N,) says so; `channels` are those of all N, None for all as before."""
         if self._channel is None:
             return
         if chosen.all():

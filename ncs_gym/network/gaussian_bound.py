@@ -22,7 +22,7 @@ def bound_violation_probability(plant: LinearPlant, channel: Channel, steps: int
     Args:
         plant: The plant, whose `delta` is the probability that a draw leaves its ellipsoid.
         channel: Gives the transmission period.
-        steps: T, the number of steps.
+        steps: T.
 
     Returns:
         At most 1, and no smaller than the exact sum.

@@ -24,15 +24,14 @@ _PAUSE, _DISAGREE = 1.5, 0.01
 class PacketLog(ReadOnlyArrays):
     """A list of times, in the order of sending: when each packet was sent and how long it was on its way.
 
-    A control loop of step dt is laid over the record by its clock. Step 0 is the time of the first packet, step k is
-    k dt later, and the last step is the last one that is no later than the last packet sent.
+    A control loop of step dt is laid over the record by its clock: step k is k dt after the first packet.
 
-    - The sample of step k is the *first* packet that is sent from step k until before step k + 1. Further packets
-      within the step are left out, since the loop samples once per step, whether the first one arrived or not.
+    - The sample of step k is the *first* packet that is sent from step k until before step k + 1; others within the
+      step are left out, whether the first one arrived or not.
     - A sample that is sent between two steps counts as taken at the earlier one, and one that arrives between two steps
       is there at the later one: it never looks fresher than it was.
     - At a step without a packet nothing is sent, which is the same as a lost sample.
-    - A sample that takes longer than 1000 steps, which no channel and no contract allows, counts as lost.
+    - A sample that takes longer than 1000 steps counts as lost.
 
     A packet that is not in the record cannot be seen. In a log of the receiver, which has none that was lost, ages may
     be too small: at both ends, and where several packets are sent per step.
@@ -109,21 +108,11 @@ class PacketLog(ReadOnlyArrays):
         )
 
     def trace(self, dt: float) -> tuple[int, ...]:
-        """Returns after how many control steps of duration dt the sample of each `send_period` arrived.
-
-        It is -1 where the sample was lost or no packet was sent.
-
-        Raises:
-            ValueError: If the record spans more than ten million steps.
-        """
+        """Returns after how many control steps of duration dt the sample of each `send_period` arrived, -1 if never."""
         return tuple(self._trace(dt).tolist())
 
     def send_period(self, dt: float) -> int:
-        """Returns the largest number of control steps of which all samples are taken at multiples.
-
-        Raises:
-            ValueError: If the record spans more than ten million steps.
-        """
+        """Returns the largest number of control steps of which all samples are taken at multiples."""
         return max(int(np.gcd.reduce(self._samples(dt)[0])), 1)
 
     def channel(self, dt: float, *, quantization_step: float = 0.0) -> TraceChannel:
@@ -139,8 +128,7 @@ class PacketLog(ReadOnlyArrays):
     def ages(self, dt: float) -> np.ndarray:
         """Returns the age of the newest sample that has arrived at every control step, shape (steps,) [steps].
 
-        That is the time since it was sent, rounded up to steps. As in environments the first estimate counts as a
-        sample of step 0.
+        That is the time since it was sent, rounded up to steps; the first estimate counts as a sample of step 0.
 
         Raises:
             ValueError: If the record spans more than ten million steps.

@@ -38,14 +38,7 @@ class StackedBursts(NamedTuple):
 
 
 class StackedChannels:
-    """What `Channel` has, for each of N channels that differ, as arrays of shape (N,).
-
-    Args:
-        channels: N of them.
-
-    Attributes:
-        replays: The records that are replayed, each with the indices of its channels.
-    """
+    """What `Channel` has, for each of N channels that differ, as arrays of shape (N,); `replays` are its records."""
 
     def __init__(self, channels: Sequence[Channel]) -> None:
         of_records: dict[int, tuple[TraceChannel, list[int]]] = {}
@@ -136,7 +129,6 @@ def transmit(
 def _transmit_by_chance(
     channel: Channel | StackedChannels, rng: np.random.Generator, state: LossState, sends: Any
 ) -> tuple[LossState, Any]:
-    """Does what `transmit` does for all channels but those that replay a record."""
     size = sends.shape if isinstance(sends, np.ndarray) else None
     bad, consecutive = state
     loss: Any = channel.loss
@@ -158,10 +150,6 @@ def _transmit_by_chance(
 class ChannelState:
     """One channel during one episode.
 
-    Args:
-        channel: The settings.
-        rng: Draws the first state of a Gilbert-Elliott chain.
-
     Attributes:
         in_flight: The packets on their way, by the step at which they arrive.
         requested: Whether the next sample is requested, of a channel that takes samples on request.
@@ -179,16 +167,10 @@ class ChannelState:
     def exchange(
         self, rng: np.random.Generator, step: int, measurement: np.ndarray | None, episode: int = 0
     ) -> list[Packet]:
-        """Puts a sample on the channel and takes off what arrives.
+        """Puts a sample on the channel; returns the packets that arrive at this step, in the order of sending.
 
-        Args:
-            rng: Source of randomness; how much is drawn does not depend on the measurement.
-            step: The current step.
-            measurement: y, shape (p,), to be quantized, stamped and sent; None where `sends_at` is False.
-            episode: Number of the estimator's episode, which the packet carries.
-
-        Returns:
-            The packets that arrive at this step, in the order in which they were sent.
+        How much is drawn does not depend on the measurement, shape (p,); None where `sends_at` is False. The packet
+        carries the number of the episode.
         """
         sample = None if measurement is None else Packet(step, self.channel.quantize(measurement), episode)
         return self.carry(rng, step, sample)
@@ -202,20 +184,11 @@ class ChannelState:
 
 
 class VectorChannelState:
-    """The channels of N environments.
-
-    Args:
-        channel: The settings, of all channels or of each of them.
-        rng: Draws the first states of Gilbert-Elliott chains.
-        size: N.
-
-    Attributes:
-        channel: These settings, stacked if they differ.
-    """
+    """The channels of N environments; `channel` are their settings, stacked if they differ."""
 
     def __init__(self, channel: Channel | Sequence[Channel], rng: np.random.Generator, size: int) -> None:
         self.channel = channel if isinstance(channel, Channel) else side_by_side(channel)
-        self._size, self._sends = size, np.zeros(size, np.bool_)
+        self._size = size
         self._all = frozen(np.ones(size, np.bool_))  # which send where each step has a sample
         self._loss_state = first_loss_state(self.channel, rng, size)
         # For the samples of each age, after how many steps they arrive.
@@ -227,8 +200,8 @@ class VectorChannelState:
         Args:
             rng: Source of randomness.
             rows: Indices of the environments.
-            channels: Those of all N environments from now on, the others' being the same as before; None for all the
-                same as before, where they do not differ.
+            channels: Those of all N environments from now on; None for all the same as before, where they do not
+            differ.
         """
         begun: Any = self.channel
         if channels is not None:
@@ -244,22 +217,14 @@ class VectorChannelState:
     def send(self, rng: np.random.Generator, steps: np.ndarray, requested: np.ndarray | None = None) -> np.ndarray:
         """Sends samples where it is time, at steps (N,) of the episodes; returns which environments send, (N,).
 
-        Args:
-            rng: Source of randomness.
-            steps: The steps.
-            requested: Where a sample is requested, shape (N,), of channels that take samples on request.
+        On request `requested`, (N,), says where.
         """
         period, sends = self.channel.send_period, requested
         if sends is None:
             sends = self._all if isinstance(period, int) and period == 1 else steps % period == 0
         self._loss_state, delays = transmit(self.channel, rng, self._loss_state, sends)
-        self._delays, self._sends = [delays, *self._delays[:-1]], sends
+        self._delays = [delays, *self._delays[:-1]]
         return sends
-
-    def arrival_of(self, e: int, step: int) -> tuple[bool, int | None]:
-        """Returns whether environment e sent at its present step, and at which step that arrives; None if never."""
-        sends, delay = bool(self._sends[e]), int(self._delays[0][e])
-        return sends, step + delay if sends and delay >= 0 else None
 
     def discard(self, chosen: Any) -> None:
         """Loses the samples that were just sent by some environments."""

@@ -17,27 +17,14 @@ class UnusedPacketsWarning(UserWarning):
 
 
 class DiscardedPackets(NamedTuple):
-    """How many packets of an episode were discarded, by reason; a packet that comes twice is not counted.
-
-    Attributes:
-        too_late: Packets that came later than the longest delay of the channel.
-        ahead: Packets stamped with a step that has not come yet.
-        other_episode: Packets with the number of another episode.
-    """
+    """How many packets of an episode were discarded: too late, stamped ahead, or of another episode."""
 
     too_late: int = 0
     ahead: int = 0
     other_episode: int = 0
 
     def with_those_of(self, packets: Iterable[Packet], step: int, episode: int, longest_delay: int) -> DiscardedPackets:
-        """Returns the counts with those of the packets that arrive at a step.
-
-        Args:
-            packets: What arrives.
-            step: Number of this step.
-            episode: Number of this episode.
-            longest_delay: Of the channel [steps].
-        """
+        """Returns the counts with those of the packets that arrive at a step of an episode."""
         too_late, ahead, other_episode = self
         for packet in packets:
             if packet.episode != episode:

@@ -15,12 +15,8 @@ from ncs_gym.validation import shown
 def spare_samples(channel: Channel, contract: ChannelContract | None) -> int | None:
     """Returns how many of the samples newer than the newest that arrived may be left out; None for any number.
 
-    It is h - L - delta, with L the longest run of losses and delta the longest delay. Where the channel keeps no such
-    contract it is zero: then every sample is requested.
-
-    Args:
-        channel: The channel.
-        contract: What is to be kept; None for nothing.
+    It is h - L - delta, with L the longest run of losses and delta the longest delay; zero, so that every sample is
+    requested, where the channel keeps no such contract.
 
     Raises:
         ValueError: If a contract is to be kept by a channel that may lose any number of packets in a row.
@@ -46,8 +42,7 @@ class Requests:
     Args:
         channel: The channel.
         contract: What is to be kept; None if nothing is promised and nothing is forced.
-        input_delay: c, the number of steps from a decision to its effect. The samples of the first c steps are
-            requested by agreement.
+        input_delay: c; the samples of the first c steps are requested by agreement.
         size: N; None for one control loop, whose values are no arrays but numbers.
 
     Attributes:
@@ -74,10 +69,8 @@ class Requests:
     def begin(self, chosen: np.ndarray | None = None, channels: Sequence[Channel] | None = None) -> None:
         """Starts episodes, in all environments or in those of a mask (N,).
 
-        Args:
-            chosen: The mask.
-            channels: Those of all environments from now on, the others' being as before; None for that of all. One that
-                loses or delays more leaves less to spare, one that promises nothing leaves nothing.
+        One of the channels of all environments from now on, None for that of all, that loses or delays more leaves less
+        to spare; one that promises nothing leaves nothing.
         """
         self._spare: Any = self._own_spare
         if self._own_spare is not None and channels is not None:
@@ -101,11 +94,8 @@ class Requests:
     def ask(self, asked: Any) -> None:
         """Asks for the sample that is decided next, or does not: the last call before `decide` counts.
 
-        Args:
-            asked: A bool, or for N environments shape (N,) as well.
-
         Raises:
-            ValueError: If it is neither.
+            ValueError: If what is given is neither a bool nor, for N environments, of shape (N,).
         """
         flags = np.asarray(asked)
         if flags.dtype != np.bool_ or flags.shape not in ((), self._shape):
@@ -116,19 +106,13 @@ class Requests:
     def outstanding(self, age: Any) -> Any:
         """Returns n, the number of samples requested that are newer than the newest that arrived, or shape (N,).
 
-        Without a contract those that cannot arrive any more do not count.
-
-        Args:
-            age: Steps since the newest sample that arrived was taken, or shape (N,).
+        `age` is that of the newest [steps], a number or shape (N,). Without a contract those that cannot arrive any
+        more do not count.
         """
         return np.count_nonzero(self._flags & self._counts & (self._back < age + self._input_delay), axis=0)
 
     def decide(self, age: Any) -> None:
-        """Decides the request of sample k + c + 1.
-
-        Args:
-            age: Steps since the newest sample that arrived was taken, or shape (N,).
-        """
+        """Decides the request of sample k + c + 1, given the age of the newest one that arrived, or shape (N,)."""
         asked, needed = self._asked, self._asked & False
         if self._spare is not None:
             needed = (self.outstanding(age) + self._spare <= age + self._input_delay) | (age > self._oldest)
@@ -139,8 +123,5 @@ class Requests:
 
     @property
     def decided(self) -> np.ndarray:
-        """Which of the samples k + 1 .. k + c + 1 are requested, after the decision of step k.
-
-        Shape (c+1,) or (c+1, N); the first is the one that is due.
-        """
+        """Which of the samples k + 1 .. k + c + 1 are requested, shape (c+1,) or (c+1, N), the first is due."""
         return self._flags[self._input_delay :: -1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -17,14 +17,14 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import contract_of, largest_age
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.networked.observations import Entries, has_floats, parts_of, snapshot, zero_of
-from ncs_gym.validation import as_count, as_flag, as_numbers, counted, setting, shown, warn_caller
+from ncs_gym.validation import as_count, as_numbers, counted, setting, shown, warn_caller
 
 # Keys of infos that are the network's own.
 INFOS = (
     *("measurement_age", "packet_arrived", "action_age", "action_applied", "packets"),
     *("channel_loss", "channel_delay", "downlink_loss", "downlink_delay"),
 )
-LATE, IDLE = ("apply", "drop", "queue"), ("hold", "neutral")
+IDLE = "hold", "neutral"
 # Keeps what the network draws apart from what an environment of the same seed draws.
 NETWORK_STREAM = 0x6E6574
 # What the agent sees instead of an old sample: (newest sample, its age, last actions, oldest first) -> observation.
@@ -37,21 +37,14 @@ class NetworkSettings:
     Args:
         observations: Space of the observations of one environment.
         actions: Space of its actions.
-        settings: The keywords of `Networked` by name.
+        settings: The keywords of `Networked` by name, as which they are kept where they are checked alone.
 
     Attributes:
         parts: The parts of observations that have a channel of their own.
         keys: Their keys; None for the whole observation.
         channels: Their channels.
         channel: The only one of them, or a dictionary of them by the keys of their parts.
-        downlink: The network of the actions; None for an ideal one.
-        fill: "last", "zero" or a predictor.
-        late: "apply", "drop" or "queue".
-        idle: "hold" or "neutral".
-        neutral: The action before the first command arrives; None where all arrive at once.
-        pending: How many of the last actions are kept.
         entries: What is added to observations.
-        delay_reward: Whether rewards travel with samples.
         recorded: The settings as JSON values, as far as they can be.
 
     Raises:
@@ -64,8 +57,7 @@ class NetworkSettings:
         for part, channel in zip(self.parts, self.channels, strict=True):
             if channel.quantization_step and not has_floats(part.space):
                 raise ValueError(f"{shown(part.space)} has no floats to quantize: leave out quantization_step")
-        if len({channel.on_request for channel in self.channels}) > 1:
-            raise ValueError("samples are taken on request on all channels or on none")
+            _require_own_time(channel)
         self.keys = None if self.parts[0].key is None else [part.key for part in self.parts]
         self.channel = self.by_part(self.channels)
         self.downlink = as_channel(settings["downlink"], "downlink")
@@ -80,18 +72,17 @@ class NetworkSettings:
         if self.fill == "zero":
             for part in self.parts:
                 zero_of(part.space)
-        self.late = _one_of(settings["late"], LATE, "late")
-        self.idle = _one_of(settings["idle"], IDLE, "idle")
-        for name, usual in (("late", LATE[0]), ("idle", IDLE[0])):
-            if self.downlink is None and getattr(self, name) != usual:
-                raise ValueError(f"{name} is about a network of the actions: give downlink=Channel(...), too")
+        self.idle = settings["idle"]
+        if not (isinstance(self.idle, str) and self.idle in IDLE):
+            raise ValueError(f"idle must be one of {', '.join(map(repr, IDLE))}, got {shown(self.idle)}")
+        if self.downlink is None and self.idle != IDLE[0]:
+            raise ValueError("idle is about a network of the actions: give downlink=Channel(...), too")
         self.neutral = _neutral(settings["neutral"], actions, needed=self.downlink is not None)
         given_pending = settings["pending"]
         self.pending = self._memory() if given_pending is None else as_count(given_pending, "pending", low=1, high=1000)
         self.entries = Entries(settings["observe"], observations, actions, len(self.parts), self.pending)
         if given_pending is not None and not ("pending_actions" in self.entries.names or callable(self.fill)):
             raise ValueError("pending is how many actions a predictor gets, or an agent that observes pending_actions")
-        self.delay_reward = as_flag(settings["delay_reward"], "delay_reward")
         self._has_warned = False
         self.recorded = dict(settings) | {
             "channel": to_json(settings["channel"]),
@@ -100,39 +91,38 @@ class NetworkSettings:
             "observe": list(self.entries.names),
         }
 
-    def by_part(self, values: Sequence[Any]) -> Any:
+    def by_part(self, values: list[Any]) -> Any:
         """Returns what belongs to the parts by their keys; what belongs to the whole observation alone."""
         return values[0] if self.keys is None else dict(zip(self.keys, values, strict=True))
 
-    def infos(
-        self, uplinks: list[EpisodeChannels], downlinks: EpisodeChannels, *, many: bool = False
-    ) -> dict[str, Any]:
+    def links(self, count: int) -> dict[tuple[str, Any], EpisodeChannels]:
+        """Returns the channels of so many environments by direction and key, those of the commands last."""
+        pairs = zip(self.parts, self.channels, strict=True)
+        up = {("channel", part.key): EpisodeChannels(each, _require_own_time, count) for part, each in pairs}
+        require = partial(_require_downlink, self.downlink)
+        return {**up, ("downlink", None): EpisodeChannels(self.downlink, require, count)}
+
+    def infos(self, links: dict[tuple[str, Any], EpisodeChannels], *, many: bool = False) -> dict[str, Any]:
         """Returns what infos say of the networks of the present episodes, arrays of N environments."""
-        parts = [links.infos("channel", many=many) for links in uplinks]
-        infos = {name: self.by_part([each[name] for each in parts]) for name in parts[0]}
-        return infos | downlinks.infos("downlink", many=many)
+        *parts, commands = (each.infos(name, many=many) for (name, _), each in links.items())
+        return {name: self.by_part([each[name] for each in parts]) for name in parts[0]} | commands
 
-    def uplinks(self, count: int) -> list[EpisodeChannels]:
-        """Returns the channels of each part in the present episodes of so many environments."""
-        return [EpisodeChannels([each] * count, partial(_require_like, each)) for each in self.channels]
-
-    def downlinks(self, count: int) -> EpisodeChannels:
-        """Returns the channels of the commands in the present episodes."""
-        return EpisodeChannels([self.downlink] * count, partial(_require_downlink, self.downlink))
-
-    def sources(self, options: dict[str, Any], uplinks: Sequence[EpisodeChannels]) -> list[list[Any]]:
-        """Returns what `EpisodeChannels.read` makes of the option "channel" for each part, and takes it out.
+    def sources(
+        self, options: dict[str, Any], links: dict[tuple[str, Any], EpisodeChannels]
+    ) -> list[tuple[EpisodeChannels, list[Any]]]:
+        """Returns the channels with what the options "channel" and "downlink" make of each, and takes the options out.
 
         Raises:
-            ValueError: If it is no channel, or of keys that observations do not have.
+            ValueError: If one is no channel, or of keys that observations do not have.
         """
-        given = options.pop("channel", None)
-        each = [given] * len(self.parts)
+        given, downlink = options.pop("channel", None), options.pop("downlink", None)
+        each = dict.fromkeys(self.keys or [None], given)
         if isinstance(given, Mapping) and self.keys is not None:
             if unknown := [key for key in given if key not in self.keys]:
                 raise ValueError(f"the option channel has the key {shown(unknown[0])}, the channels' are {self.keys}")
-            each = [given.get(key) for key in self.keys]
-        return [links.read(one, "channel") for one, links in zip(each, uplinks, strict=True)]
+            each = {key: given.get(key) for key in self.keys}
+        asked = [*each.values(), downlink]
+        return [(found, found.read(one, name)) for one, ((name, _), found) in zip(asked, links.items(), strict=True)]
 
     def warn_of_lacking_actions(self, age: int) -> None:
         """Warns the caller, once, where a predictor lacks actions that were decided since the newest sample."""
@@ -150,9 +140,7 @@ class NetworkSettings:
         ages = [largest_age(contract_of(each), each.usual_age) for each in self.channels]
         if self.downlink is None:
             return max(*ages, 1)
-        # In a queue what takes longest waits for those that have overtaken it, but for one that arrives after it.
-        waits = max(self.downlink.longest_delay - self.downlink.delay - 1, 0) if self.late == "queue" else 0
-        return max(max(ages) + downlink_protocol(self.downlink, None).input_delay + waits, 1)
+        return max(max(ages) + downlink_protocol(self.downlink, None).input_delay, 1)
 
 
 class ReadNetwork:
@@ -160,13 +148,8 @@ class ReadNetwork:
 
     channel: Any = setting("channel", "_settings.channel")
     downlink: Channel | None = setting("downlink", "_settings.downlink")
-    observe: tuple[str, ...] = setting("observe", "_settings.entries.names")
-    fill: Any = setting("fill", "_settings.fill")
-    late: str = setting("late", "_settings.late")
-    idle: str = setting("idle", "_settings.idle")
-    neutral: Any = setting("neutral", "_settings.neutral")
     pending: int = setting("pending", "_settings.pending")
-    delay_reward: bool = setting("delay_reward", "_settings.delay_reward")
+    links: dict[tuple[str, Any], EpisodeChannels] = setting("links")
 
     _settings: NetworkSettings
     _rng: np.random.Generator | None = None
@@ -186,21 +169,11 @@ def network_rng(seed: Any) -> np.random.Generator:
 
 
 def as_channel(value: Any, name: str) -> Channel | None:
-    """Returns a channel, also one whose fields a dictionary holds; None for None.
-
-    Raises:
-        ValueError: If it is neither.
-    """
+    """Returns a channel, also one whose fields a dictionary holds, None for None; raises ValueError for others."""
     channel = from_json(value, (Channel,), name)
     if channel is None or isinstance(channel, Channel):
         return channel
     raise ValueError(f"{name} must be a Channel, or a dictionary of its fields, got {shown(value)}")
-
-
-def _one_of(value: Any, known: tuple[str, ...], name: str) -> str:
-    if not (isinstance(value, str) and value in known):
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, known))}, got {shown(value)}")
-    return value
 
 
 def _neutral(given: Any, actions: spaces.Space, needed: bool) -> Any:
@@ -223,16 +196,15 @@ def _neutral(given: Any, actions: spaces.Space, needed: bool) -> Any:
 
 
 def _has_choices(actions: spaces.Space) -> bool:
-    """Returns whether some part of actions is a number of a list, whose zero is an action like any other."""
     if isinstance(actions, spaces.Dict | spaces.Tuple):
         inner = actions.spaces.values() if isinstance(actions, spaces.Dict) else actions.spaces
         return any(map(_has_choices, inner))
     return isinstance(actions, spaces.Discrete | spaces.MultiDiscrete)
 
 
-def _require_like(declared: Channel, channel: Channel) -> None:
-    if channel.on_request != declared.on_request:
-        raise ValueError(f"the environment was made for channels with on_request={declared.on_request}")
+def _require_own_time(channel: Channel) -> None:
+    if channel.on_request:
+        raise ValueError("samples on request are for an NCSEnv: leave out on_request")
 
 
 def _require_downlink(declared: Channel | None, channel: Channel) -> None:

@@ -19,12 +19,7 @@ ENTRIES = "age", "arrived", "pending_actions"
 
 
 class Part(NamedTuple):
-    """A part of an observation that has a channel of its own.
-
-    Attributes:
-        key: Its key in a `Dict`, its index in a `Tuple`; None for the whole observation.
-        space: Its space.
-    """
+    """A part of an observation with a channel of its own: key in a `Dict` or `Tuple`, None for the whole, and space."""
 
     key: Any
     space: spaces.Space
@@ -37,10 +32,8 @@ class Part(NamedTuple):
 def parts_of(space: spaces.Space, channel: Any) -> tuple[list[Part], list[Any]]:
     """Returns the parts of observations that travel alone, and the channel or channels to draw from of each.
 
-    Args:
-        space: The space of the observations.
-        channel: What `Networked` was given: one for all, or one for each key of a `Dict` or entry of a `Tuple`; keys
-            that are left out arrive at once.
+    `channel` is what `Networked` was given: one for all, or one for each key of a `Dict` or entry of a `Tuple`; keys
+    that are left out arrive at once.
 
     Raises:
         ValueError: If there are channels of keys that the space does not have.
@@ -72,10 +65,7 @@ def joined(parts: Sequence[Part], seen: Sequence[Any]) -> Any:
 def quantized(channel: Any, space: spaces.Space, sample: Any) -> Any:
     """Returns a sample with its entries of floats rounded as a channel does, within their limits; others as they are.
 
-    Args:
-        channel: What has `quantize`; of N environments stacked, whose samples have N as the first axis.
-        space: Space of one sample.
-        sample: The sample.
+    Of N environments, whose channel is stacked, samples have N as the first axis.
     """
     if isinstance(space, spaces.Dict):
         return {key: quantized(channel, each, sample[key]) for key, each in space.spaces.items()}
@@ -96,19 +86,8 @@ def has_floats(space: spaces.Space) -> bool:
     return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating)
 
 
-def is_batched(space: spaces.Space) -> bool:
-    """Returns whether vector environments hold observations of many environments as arrays with a first axis more."""
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        return all(map(is_batched, space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces))
-    return isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary)
-
-
 def zero_of(space: spaces.Space) -> Any:
-    """Returns the zero of a space.
-
-    Raises:
-        ValueError: If the space has none.
-    """
+    """Returns the zero of a space; raises ValueError if it has none."""
     if isinstance(space, spaces.Dict):
         return {key: zero_of(each) for key, each in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
@@ -192,8 +171,7 @@ class Entries:
             observation: What is seen of the environment, of N environments a batch.
             age: Of the newest sample of each part, shape (parts,) or (N, parts) [steps].
             arrived: Whether one arrived, likewise.
-            pending: The pending actions, oldest first, shape (pending, ...) or (N, pending, ...); None where they are
-                not asked for.
+            pending: The pending actions, oldest first, shape (pending, ...) or (N, pending, ...), where asked for.
         """
         if not self.names:
             return observation
@@ -227,11 +205,7 @@ class Entries:
 
 
 def pending_space(actions: spaces.Space, pending: int) -> spaces.Box:
-    """Returns the space of so many actions, the first axis; those that are no numbers as vectors of zeros and ones.
-
-    Raises:
-        ValueError: If the actions are of a kind that is not told as an array.
-    """
+    """Returns the space of so many actions, the first axis; those that are no numbers as vectors of zeros and ones."""
     if isinstance(actions, spaces.Box):
         low, high = (np.broadcast_to(end, (pending, *actions.shape)) for end in (actions.low, actions.high))
         return spaces.Box(low, high, dtype=actions.dtype)  # type: ignore[arg-type]

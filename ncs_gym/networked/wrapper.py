@@ -12,9 +12,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from ncs_gym.envs.env import NCSEnv
-from ncs_gym.network.channel import Channel, require_on_request
+from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.network.requests import Requests
 from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,
@@ -24,11 +23,8 @@ from ncs_gym.networked.network_settings import (
     require_no_network,
     require_no_restarts,
 )
-from ncs_gym.networked.observations import OLDEST_OBSERVED, joined, quantized, snapshot, zero_of
-from ncs_gym.validation import shown, warn_caller
-
-# Steps after which an agent that may ask for samples is told that nobody does.
-PATIENCE = 10
+from ncs_gym.networked.observations import joined, quantized, snapshot, zero_of
+from ncs_gym.validation import shown
 
 
 class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
@@ -74,26 +70,18 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             is given that sample, its age and the last `pending` actions decided, oldest first (a list where actions are
             no arrays), of which those of the last `age` steps came after the sample. What it returns is passed on as it
             is, also out of the space.
-        late: "apply" lets the newest command that has arrived act. "drop" does not wait for commands that take longer
-            than `downlink.delay`. "queue" lets all commands act in the order of their arrival, one in each step.
-        idle: What acts where no command arrived: "hold", the one before, or "neutral".
+        idle: What acts where no newer command arrived: "hold", the one before, or "neutral".
         neutral: The action before the first command arrives; the zero of the actions by default, and needed behind a
             downlink where they have none.
         pending: How many of the last actions are kept; by default as many as the contracts of both channels allow the
             newest sample to lack, or where there is no contract as it lacks in 95 % of the steps (of a downlink those
-            of its delays, in a "queue" with what commands wait).
-        delay_reward: Whether rewards travel with samples: the agent gets what was earned until the newest one was
-            taken, and at the end of an episode the rest. A `TimeLimit` belongs inside: of an end outside nobody knows.
+            of its delays).
 
     Attributes:
         channel: The channel of the observations; with several a dictionary of them.
         downlink: The channel of the actions; None for an ideal one.
         episode_channel: The channel of this episode; with several a dictionary of them. `reset` takes another one as
             its option "channel" (and "downlink"), or what draws one (`RandomChannel`).
-
-    Warns:
-        UserWarning: Once in an episode, where the channel takes samples on request and nobody asks (`RequestActions`);
-            at `reset`, where the rest of delayed rewards was not paid.
 
     Raises:
         ValueError: If a setting is wrong, or does not fit the environment's spaces.
@@ -106,14 +94,12 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         downlink: Channel | Mapping[str, Any] | None = None,
         observe: Sequence[str] = (),
         fill: str | Predictor = "last",
-        late: str = "apply",
         idle: str = "hold",
         neutral: Any = None,
         pending: int | None = None,
-        delay_reward: bool = False,
     ) -> None:
-        given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "late": late, "idle": idle}
-        given |= {"neutral": neutral, "pending": pending, "delay_reward": delay_reward}
+        given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "idle": idle}
+        given |= {"neutral": neutral, "pending": pending}
         if not isinstance(env, gym.Env):
             raise ValueError(f"Networked takes an environment, as gym.make returns it, got {shown(env)}")
         if isinstance(env.unwrapped, NCSEnv):
@@ -123,10 +109,8 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, **settings.recorded)
         gym.Wrapper.__init__(self, env)
         self.observation_space = settings.entries.space
-        self._uplinks, self._downlinks = settings.uplinks(1), settings.downlinks(1)
-        on_request = settings.channels[0].on_request
-        self._requests = Requests(settings.channels[0], None) if on_request else None
-        self._earned = self._told = 0.0
+        self._links = settings.links(1)
+        *self._uplinks, self._downlinks = self._links.values()
         self._network: Any = None  # what infos say of it in this episode
         self._arrivals = [_Arrivals() for _ in settings.parts]
         self._sees_newest = settings.keys is None and settings.fill == "last" and not settings.entries.names
@@ -135,7 +119,7 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
 
     @property
     def episode_channel(self) -> Any:
-        """The channel of this episode; with several a dictionary of them."""
+        """See the class."""
         return self._settings.by_part([links.now[0] for links in self._uplinks])
 
     @property
@@ -151,37 +135,26 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             options: {"channel": c}, {"downlink": c} give this episode another channel, or a function (rng) -> Channel
                 that draws one; with several channels a dictionary of these. The rest is the environment's.
         """
-        if self._earned != self._told:
-            warn_caller(
-                f"rewards of {self._earned - self._told:.6g} were on their way when the episode was left: with "
-                "delay_reward a TimeLimit belongs inside Networked",
-                UserWarning,
-            )
         own = dict(options or {})
-        sources = self._settings.sources(own, self._uplinks)
-        downlink = self._downlinks.read(own.pop("downlink", None), "downlink")
+        sources = self._settings.sources(own, self._links)
         if seed is not None:
             self._rng = network_rng(seed)
-        rng, every = self.np_random, (*self._uplinks, self._downlinks)
-        read = [links.drawn(each, rng) for links, each in zip(every, (*sources, downlink), strict=True)]
+        rng = self.np_random
+        drawn = [(links, links.drawn(each, rng)) for links, each in sources]
         observation, info = self.env.reset(seed=seed, options=own or None)
         require_no_network(info)  # before anything changes
-        for links, given in zip(every, read, strict=True):
+        for links, given in drawn:
             links.give(given)
             links.begin(rng)
-        self._network = self._settings.infos(self._uplinks, self._downlinks)
+        self._network = self._settings.infos(self._links)
         self._step = self._packets = 0
         sample = snapshot(observation)
         for part, arrivals, links in zip(self._settings.parts, self._arrivals, self._uplinks, strict=True):
             arrivals.begin(ChannelState(links.now[0], rng), part.of(sample))
         settings, given = self._settings, self.episode_downlink
         self._actuator = None if given is None else _Actuator(settings, ChannelState(given, rng))
-        self._is_asked = False
-        if self._requests is not None:
-            self._requests.begin()
         idle = settings.neutral if settings.neutral is not None else nothing(self.action_space)
         self._decided: deque[Any] = deque([idle] * settings.pending, settings.pending)
-        self._earned = self._told = 0.0
         return self._seen(), self._with_network(info, idle, 0)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -195,71 +168,29 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             applied, action_age = self._actuator.exchange(rng, step, snapshot(action))
         if self._keeps_actions:
             self._decided.append(snapshot(action))
-        if self._requests is not None:
-            self._requests.decide(self._oldest)
         # A copy: environments may change their actions in place, and this one may act again.
         observation, reward, terminated, truncated, info = self.env.step(snapshot(applied))
         self._step = step = step + 1
-        if step == PATIENCE and self._requests is not None and not self._is_asked:
-            warn_caller(
-                f"the channel sends samples on request, and nobody called request in {PATIENCE} steps: the agent sees "
-                "nothing but the first observation; put RequestActions around Networked, or call request before steps",
-                UserWarning,
-            )
-        self._earned += np.asarray(reward, np.float64).item() if settings.delay_reward else 0.0
         sample = None
         for part, arrivals in zip(settings.parts, self._arrivals, strict=True):
             link, packet = arrivals.link, None
-            if link.sends_at(step) if self._requests is None else self._requests.requested:
+            if link.sends_at(step):
                 if sample is None:
                     sample = snapshot(observation)
                 own = part.of(sample)
                 if link.channel.quantization_step:
                     own = quantized(link.channel, part.space, own)
-                packet = step, own, self._earned
+                packet = step, own
                 self._packets += 1
             arrivals.take(link.carry(rng, step, packet))
-        if settings.delay_reward:
-            newest = max(self._arrivals, key=lambda each: each.stamp)
-            earned = self._earned if terminated or truncated else newest.earned
-            reward, self._told = earned - self._told, earned
         return self._seen(), reward, terminated, truncated, self._with_network(info, applied, action_age)
-
-    def request(self, asked: bool = True) -> None:
-        """Asks for samples in the next step, where the channel takes them on request (`RequestActions`).
-
-        Raises:
-            ValueError: If the channel sends samples by itself, or what is given is no bool.
-        """
-        require_on_request(self._requests).ask(asked)
-        self._is_asked = True
-
-    @property
-    def outstanding(self) -> int:
-        """Number of samples requested that are newer than the newest that arrived and may still arrive."""
-        return int(require_on_request(self._requests).outstanding(self._oldest))
-
-    @property
-    def request_state(self) -> tuple[int, int]:
-        """The age of the newest sample, of several the oldest, and `outstanding` [steps, samples]."""
-        return self._oldest, self.outstanding
-
-    @property
-    def request_limits(self) -> np.ndarray:
-        """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
-        delays = [channel.longest_delay for channel in self._settings.channels]
-        return np.array([OLDEST_OBSERVED, max(*delays, 1)], dtype=np.float64)
-
-    @property
-    def _oldest(self) -> int:
-        return self._step - min(arrivals.stamp for arrivals in self._arrivals)
 
     def _seen(self) -> Any:
         """Returns what the agent sees now."""
         settings, step = self._settings, self._step
         if self._sees_newest:
-            return self._arrivals[0].seen()
-        seen = [arrivals.seen() for arrivals in self._arrivals]
+            return snapshot(self._arrivals[0].sample)
+        seen = [snapshot(arrivals.sample) for arrivals in self._arrivals]
         if settings.fill == "zero":
             pairs = zip(seen, settings.parts, self._arrivals, strict=True)
             seen = [each if arrivals.is_new(step) else zero_of(part.space) for each, part, arrivals in pairs]
@@ -291,26 +222,14 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
 
 
 class _Arrivals:
-    """What has arrived of a part of the observations.
-
-    Attributes:
-        link: Its channel.
-        stamp: Step at which the newest sample was taken.
-        sample: That sample.
-        arrived: Whether it arrived at this step.
-        earned: Sum of the rewards until it was taken.
-    """
+    """What has arrived of a part of the observations: the newest sample, its step, and whether it arrived now."""
 
     link: ChannelState
 
     def begin(self, link: ChannelState, sample: Any) -> None:
         """Starts an episode, whose first sample is there."""
         self.link, self.sample = link, sample
-        self.stamp, self.arrived, self.earned = 0, False, 0.0
-
-    def seen(self) -> Any:
-        """Returns the newest sample for the agent."""
-        return snapshot(self.sample)
+        self.stamp, self.arrived = 0, False
 
     def is_new(self, step: int) -> bool:
         """Returns whether the newest sample arrived at this step, as the first of an episode does."""
@@ -319,29 +238,23 @@ class _Arrivals:
     def take(self, packets: list[Any]) -> None:
         """Takes the packets that arrive at this step."""
         self.arrived = False
-        for stamp, sample, earned in packets:
+        for stamp, sample in packets:
             if stamp > self.stamp:
-                self.stamp, self.sample, self.earned, self.arrived = stamp, sample, earned, True
+                self.stamp, self.sample, self.arrived = stamp, sample, True
 
 
 class _Actuator:
     """The commands on their way and the one that acts."""
 
     def __init__(self, settings: NetworkSettings, link: ChannelState) -> None:
-        self._link, self._late, self._idle, self._neutral = link, settings.late, settings.idle, settings.neutral
+        self._link, self._idle, self._neutral = link, settings.idle, settings.neutral
         self._action, self._stamp = settings.neutral, -1
-        self._queue: deque[tuple[int, Any]] = deque()
 
     def exchange(self, rng: np.random.Generator, step: int, action: Any) -> tuple[Any, int]:
         """Sends an action; returns the one that acts at this step, and its age, -1 for `neutral` [steps]."""
         arrived = self._link.carry(rng, step, (step, action))
-        if self._late == "drop":
-            arrived = [each for each in arrived if step - each[0] == self._link.channel.delay]
-        if self._late == "queue":
-            self._queue += arrived
-            arrived = [self._queue.popleft()] if self._queue else []
         newest = max(arrived, key=lambda each: each[0], default=None)
-        if newest is not None and (newest[0] > self._stamp or self._late == "queue"):
+        if newest is not None and newest[0] > self._stamp:
             self._stamp, self._action = newest
         elif self._idle == "neutral" or self._stamp < 0:
             return self._neutral, -1

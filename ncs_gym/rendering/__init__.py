@@ -1,7 +1,6 @@
 """Pictures of an environment: the plant, the packets in the network, the phase plane and what the shield does.
 
-An environment with a render mode records every step with a `Renderer` and asks it for frames; a shield adds what it
-knows with an `Annotation`. pygame is imported when the first frame is drawn, not before.
+An environment with a render mode records every step with a `Renderer`; a shield adds an `Annotation`.
 """
 
 from ncs_gym.rendering.episode_record import Annotation, sent_at

@@ -73,10 +73,6 @@ class TrackedOutput(NamedTuple):
 class EpisodeRecord:
     """The recent past of one episode; what draws a frame reads nothing else.
 
-    Args:
-        plant: The plant that is drawn.
-        task: The task, which may track a quantity.
-
     Attributes:
         step: Steps taken in this episode.
         info: The info of the newest step.

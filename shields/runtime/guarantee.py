@@ -67,10 +67,9 @@ class MonitorState(NamedTuple):
 class GuaranteeMonitor:
     """Whether x in S is proved now, and why not (docs/shield.md, "How you see that an assumption broke").
 
-    S is the certificate's safe set: its polytope, or its ellipsoid if it has none.
-
-    In mode "lookahead" it is whether x is in the box now and stays there: "in S, or in the box with a certified tail
-    stored". The caller keeps the store from decision to decision, and drops it where another input is applied.
+    S is the certificate's safe set: its polytope, or its ellipsoid if it has none. In mode "lookahead" it is whether x
+    is in the box now and stays there: "in S, or in the box with a certified tail stored". The caller keeps the store
+    from decision to decision, and drops it where another input is applied.
 
     An alarm of the innovation monitor, an input other than the decided one, a step that is not one step and an estimate
     so far out that rounding counts break the error bound for the rest of the episode. The others are recoverable: a
@@ -78,8 +77,8 @@ class GuaranteeMonitor:
     only K x_hat is not proved safe with it. Of a plant with a remainder nothing is recoverable: its error bound holds
     only while every state so far is proved to be in the box (docs/beyond_linear.md).
 
-    Behind a downlink what is observed belongs to the time at which the next input takes effect, and so does `inside`.
-    It is proved for the present as soon as it was proved for this time, c steps ago.
+    Behind a downlink `inside` is about the time at which the next input takes effect; it is proved for the present as
+    soon as it was proved for this time, c steps ago.
 
     Methods are functions of a state and of what happened, truth values for one loop and arrays (N,) for many.
 

@@ -66,6 +66,7 @@ class Guard(CopiedWhole, ABC):
         if downlink.channel is not None:
             self._schedule = CommittedInputs(self.input_delay, m if size is None else (m, size))
         self._channels: set[Channel] = set()
+        self._size, self._idle = size, np.zeros(m if size is None else (m, size))
 
     belief: Belief
     errors: PredictedErrors
@@ -77,6 +78,12 @@ class Guard(CopiedWhole, ABC):
     # The clock of the loop when it was observed last, and how many inputs were decided since.
     _moves: Any
     _asked = 0
+    # What this episode has of interventions, of states and of those proved, and which loops the next `info` counts.
+    _interventions: Any
+    _count: Any
+    _proved: Any
+    _counted: Any = True
+    _no_reason: Any = ""
 
     def observe(self, belief: Belief) -> None:
         """Takes in what is known after the step that followed the decision."""
@@ -94,12 +101,47 @@ class Guard(CopiedWhole, ABC):
         happened = self._decision, moved_once, same_input, belief, self.errors, on_time
         self._state = self._monitor.advance(self._state, *happened)
 
+    @property
+    def code(self) -> Any:
+        """Why the state is not proved safe now, an index of `EXPLANATIONS` or shape (N,); 0 while it is."""
+        return self._monitor.reasons(self._state, self.belief.age)
+
     def look_at(self, channels: Sequence[Channel]) -> None:
         """Warns the caller of channels that are new and break the contract of the certificate."""
         present = set(channels)
         for channel in present - self._channels:
             warn_of_broken_contract(self.filter.certificate.contract, channel, self.input_delay)
         self._channels = present
+
+    def info(self) -> dict[str, Any]:
+        """Returns the keys of `info`, and counts: once after each `begin` or `observe`."""
+        decided, proposed, size = self._decision, self._proposed, self._size
+        code = self._monitor.reasons(self._state, self.belief.age)
+        is_proved = not code if size is None else code == 0
+        self._count, self._proved = self._count + self._counted, self._proved + (is_proved & self._counted)
+        self._interventions = self._interventions + decided.intervened
+        doubted = code if size is None else np.count_nonzero(code)
+        if doubted:
+            self.lost.note(code, 0 if size is None else np.arange(size))
+        if size is None:
+            corrected = hypot(*(decided.input - proposed).tolist()) if decided.intervened else 0.0
+        else:
+            corrected = norms(decided.input - proposed)
+        told = {"shield_plan_length": self._plan_length()} if self.filter.horizon else {}
+        told |= {
+            "shield_intervened": decided.intervened,
+            "input_proposed": proposed.T,
+            "shield_correction": corrected,
+            "shield_margin": decided.margin,
+            "shield_guaranteed": is_proved,
+            "shield_reason": _EXPLANATIONS[code] if doubted else self._no_reason,
+            "episode_interventions": self._interventions,
+            "episode_guaranteed": self._proved / self._count,
+        }
+        if size is None:
+            told["input_proposed"] = proposed.copy()
+            return told
+        return {key: value.copy() for key, value in told.items()}
 
     def _covered(
         self, state: MonitorState, earlier: Sequence[tuple[np.ndarray, Any]], insides: Sequence[Any]
@@ -110,6 +152,10 @@ class Guard(CopiedWhole, ABC):
             quiet = self.belief._replace(estimate=estimate, number=number, alarm=False, damaged=False, outside=False)
             known.append((inside, quiet, self._errors_of.of(quiet.table, number)))
         return self._monitor.cover(state, known)
+
+    @abstractmethod
+    def _plan_length(self) -> Any:
+        """Returns how many inputs are stored, an int or shape (N,)."""
 
     @abstractmethod
     def _drop(self, goes_on: Any) -> None:
@@ -123,8 +169,6 @@ class OneGuard(Guard):
         super().__init__(safety_filter, downlink, on_unproved)
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
-        self._idle = np.zeros(safety_filter.plant.m)
-        self._interventions = self._proved = self._count = 0
 
     def begin(self, beginning: Beginning, mask: Any = None) -> None:
         """Begins an episode."""
@@ -138,12 +182,7 @@ class OneGuard(Guard):
         margin = self.filter.margin(belief.estimate, self.errors, self._idle)
         self._decision, self._proposed = Decision(self._idle, False, False, False, margin, ""), self._idle
 
-    def start(
-        self,
-        belief: Belief,
-        known: Sequence[StartKnown],
-        earlier: Sequence[tuple[np.ndarray, int]],
-    ) -> None:
+    def start(self, belief: Belief, known: Sequence[StartKnown], earlier: Sequence[tuple[np.ndarray, int]]) -> None:
         """Begins to follow whether the state is proved safe, at the start of an episode.
 
         Args:
@@ -176,32 +215,10 @@ class OneGuard(Guard):
         decision = self.decide(u)
         return decision.input if decision.intervened else u
 
-    @property
-    def reason(self) -> str:
-        """Why the state is not proved safe now; empty while it is."""
-        return EXPLANATIONS[self._monitor.reasons(self._state, self.belief.age)]
+    def _plan_length(self) -> int:
+        return len(self._stored)
 
-    def info(self) -> dict[str, Any]:
-        """Returns the keys of `info`, and counts: once after each `begin` or `observe`."""
-        decision, proposed, code = self._decision, self._proposed, self._monitor.reasons(self._state, self.belief.age)
-        self._count += 1
-        self._proved += not code
-        self._interventions += decision.intervened
-        if code:
-            self.lost.note(code)
-        ahead = {"shield_plan_length": len(self._stored)} if self.filter.mode == "lookahead" else {}
-        return ahead | {
-            "shield_intervened": decision.intervened,
-            "input_proposed": proposed.copy(),
-            "shield_correction": hypot(*(decision.input - proposed).tolist()) if decision.intervened else 0.0,
-            "shield_margin": decision.margin,
-            "shield_guaranteed": not code,
-            "shield_reason": EXPLANATIONS[code],
-            "episode_interventions": self._interventions,
-            "episode_guaranteed": self._proved / self._count,
-        }
-
-    def plan(self, loop: int = 0) -> np.ndarray:
+    def plan(self) -> np.ndarray:
         """Returns the inputs stored for the steps to come, shape (k, m)."""
         return self._stored.copy()
 
@@ -211,15 +228,7 @@ class OneGuard(Guard):
 
 
 class ManyGuards(Guard):
-    """The guard of N loops, the last axis of every array.
-
-    Args:
-        safety_filter: Makes the decisions.
-        downlink: How commands are sent.
-        initial_set: Contains the starts that no option gave.
-        on_unproved: "warn", "raise" or "ignore".
-        size: N.
-    """
+    """The guard of N loops, the last axis of every array; `initial_set` has the starts that no option gave."""
 
     def __init__(
         self,
@@ -230,7 +239,6 @@ class ManyGuards(Guard):
         size: int,
     ) -> None:
         super().__init__(safety_filter, downlink, on_unproved, size)
-        self._size, self._idle = size, np.zeros((safety_filter.plant.m, size))
         self._drawn = starts_known(safety_filter, initial_set, self.input_delay)
         self._none = none = np.zeros(size, np.bool_)
         self._state = MonitorState(np.zeros(size, np.int64), none, none, none, np.zeros(size, np.int64))
@@ -249,7 +257,7 @@ class ManyGuards(Guard):
         self.look_at(channels)
         self.lost.begin(mask)
         self.belief, self.errors = belief, self._errors_of.of(belief.table, belief.number)
-        known = [self._drawn] * self._size
+        known = [self._drawn] * len(mask)
         for e in np.flatnonzero(mask & ~np.isnan(starts[:, 0])).tolist():
             known[e] = starts_known(self.filter, starts[e], self.input_delay)
         is_safe = np.array([each[-1].in_safe_set for each in known])
@@ -290,34 +298,8 @@ class ManyGuards(Guard):
         self._stored, self._asked = decided.plan.copy(), self._asked + 1
         return decided.input
 
-    def info(self) -> dict[str, Any]:
-        """Returns the keys of `info`, and counts: once after each `begin` or `observe`."""
-        decided, proposed = self._decision, self._proposed
-        reasons = self._monitor.reasons(self._state, self.belief.age)
-        is_proved = reasons == 0
-        self._count, self._proved = self._count + self._counted, self._proved + (is_proved & self._counted)
-        self._interventions = self._interventions + decided.intervened
-        doubted = np.count_nonzero(reasons) > 0
-        if doubted:
-            self.lost.note(reasons, np.arange(self._size))
-        ahead = {}
-        if len(self._stored):
-            ahead["shield_plan_length"] = np.count_nonzero(~np.isnan(self._stored[:, 0]), axis=0)
-        return ahead | {
-            "shield_intervened": decided.intervened.copy(),
-            "input_proposed": proposed.T.copy(),
-            "shield_correction": norms(decided.input - proposed),
-            "shield_margin": decided.margin.copy(),
-            "shield_guaranteed": is_proved,
-            "shield_reason": _EXPLANATIONS[reasons] if doubted else self._no_reason,
-            "episode_interventions": self._interventions.copy(),
-            "episode_guaranteed": self._proved / self._count,
-        }
-
-    def plan(self, loop: int = 0) -> np.ndarray:
-        """Returns the inputs stored for the steps to come of a loop, shape (k, m)."""
-        plan = self._stored[..., loop]
-        return plan[~np.isnan(plan[:, 0])] if len(plan) else plan.copy()
+    def _plan_length(self) -> np.ndarray:
+        return np.count_nonzero(~np.isnan(self._stored[:, 0]), axis=0)
 
     def _leave(self, strayed: np.ndarray) -> None:
         """Ends the proof of loops that moved without this guard."""

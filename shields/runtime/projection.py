@@ -25,8 +25,8 @@ def closest_admissible(
 
     One input is an interval. Otherwise by branching on input limits: if the solution without the limits breaks some of
     them, then at the true solution at least one of those is attained (otherwise a small move towards the former would
-    stay feasible and be closer). The candidates of all problems, each a problem and the limits it holds, are solved
-    together; one that is farther away than a solution found is not branched on.
+    stay feasible and be closer). A candidate is a problem and the limits it holds; one that is farther away than a
+    solution found is not branched on.
 
     Args:
         wanted: Shape (m, N), within the limits.
@@ -145,10 +145,7 @@ def _onto_balls(
 
 
 def _multipliers(s: np.ndarray, away: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Returns t >= 0, shape (F,), with sum_i s_i (away_i / (1 + t s_i))^2 <= reach, by Newton's method.
-
-    Where the reach is negative the result means nothing.
-    """
+    """Returns t >= 0, shape (F,), with sum_i s_i (away_i / (1 + t s_i))^2 <= reach, by Newton's method."""
     multiplier = np.zeros(len(reach))
     for _ in range(NEWTON_STEPS):
         shrunk = 1.0 / (1.0 + multiplier * s)
@@ -165,8 +162,8 @@ def _multipliers(s: np.ndarray, away: np.ndarray, reach: np.ndarray) -> np.ndarr
 def _orthogonal_images(effect: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns effect V with orthogonal columns, shape (n, k, F), and V with orthonormal ones, shape (m, k, F).
 
-    V leaves out only directions that move nothing. Two inputs, the commonest case, need one rotation by an angle in
-    closed form; more inputs a singular value decomposition, a hundred times slower in large batches.
+    V leaves out only directions that move nothing. Two inputs need one rotation in closed form; the singular value
+    decomposition of more takes a hundred times as long.
     """
     if effect.shape[1] > 2:
         images, gains, axes = np.linalg.svd(effect.transpose(2, 0, 1), full_matrices=False)
@@ -227,11 +224,11 @@ def _closest_on_edges(
     limits: np.ndarray,
     beyond: np.ndarray,
 ) -> np.ndarray:
-    """Returns `closest`, shape (2, N), with what `closest_between` finds of two inputs, many problems at once.
+    """Returns `closest`, shape (2, N), with what `closest_between` finds of two inputs.
 
     Nothing is closer than the edge that the wanted point is farthest beyond: if the foot on it is admissible, it is the
-    closest. Else that lies on some edge that the wanted point is beyond, and on the line of each of these it is in an
-    interval. `values` are those of the rows at the wanted inputs, `beyond` says which problems are beyond which edges.
+    closest. Else the closest lies on some edge that the wanted point is beyond, in an interval of its line. `values`
+    are those of the rows at the wanted inputs, `beyond` says which problems are beyond which edges.
     """
     squares = (effect * effect).sum(axis=1)
     beyond = beyond & (squares > 0.0)[:, None]
@@ -274,12 +271,8 @@ def _shortest(effect: np.ndarray, values: np.ndarray, limits: np.ndarray) -> np.
     """Returns argmin |x| over |values + effect x| <= limits, shape (m,); NaN where there is none.
 
     For rows G x >= h that is a problem of least distance: with z >= 0 of the smallest r = (G' z, h' z - 1),
-    x = -r[:m] / r[m] (Lawson and Hanson 1974, chapter 23, docs/bibliography.md).
-
-    Args:
-        effect: Shape (r, m).
-        values: Shape (r,); x = 0 does not fulfil all rows.
-        limits: Shape (r,).
+    x = -r[:m] / r[m] (Lawson and Hanson 1974, chapter 23, docs/bibliography.md). Effect is (r, m), values and
+    limits (r,); x = 0 does not fulfil all rows.
     """
     from scipy.optimize import nnls  # takes long to import
 

@@ -78,7 +78,7 @@ def rows_within_step(plant: LinearPlant) -> RowsWithinStep:
 
 
 def _shrunk(ends: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ends, shape (k,) each, of rows that are divided by what is left of half their range, shape (k,)."""
+    """Returns the ends of rows that are divided by what is left of half their range, shape (k,) each."""
     (low, high), some = ends, left > 0.0
     return np.where(some, (low + 1.0 - left) / left, -1.0), np.where(some, (high - 1.0 + left) / left, 1.0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from enum import Enum, auto
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -32,25 +32,15 @@ from ncs_gym.validation import (
 )
 from shields.certificate import Certificate
 from shields.runtime.decisions import Decision
-from shields.runtime.guarantee import (
-    LATE_INPUT,
-    NOT_CONFIRMED,
-    OTHER_EPISODE,
-    OTHER_INPUT,
-)
+from shields.runtime.guarantee import EXPLANATIONS, LATE_INPUT, NOT_CONFIRMED, OTHER_EPISODE, OTHER_INPUT
 from shields.runtime.guard import OneGuard
 from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.starts import starts_known
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 NOT_STARTED = "no episode is under way: call start"
 
 
 class _Phase(Enum):
-    """Where in a control step a loop is."""
-
     STOPPED = auto()
     STARTED = auto()
     RECEIVED = auto()
@@ -70,39 +60,35 @@ class SafeLoop(CopiedWhole):
             apply(loop.decide(controller(x_hat)).input)
             wait_for_the_next_step()
 
-    `step` is both in one call, for proposals that do not need the newest estimate. Steps are counted from 0 at
-    `start`; a packet carries the number of the step at which its sample was taken, and that of the episode.
+    Steps are counted from 0 at `start`; a packet carries the number of the step at which its sample was taken, and that
+    of the episode.
 
     The guarantee is that of `SafetyShield`, under the same assumptions (docs/shield.md): `guaranteed` says whether the
-    state is proved to be in the certificate's safe set S at this step, `reason` why not. What the loop cannot see is
-    that the clock misses a step, that the actuator applies something else (unless it is told, or hears `echoes`), or
-    that packets carry wrong stamps. A certificate under a channel contract brings its error sets along. Not for use by
-    several threads at once. A loop can be pickled between two calls, and goes on from there where it is loaded. Where
-    `start`, `receive` or `decide` is interrupted, by whatever it may be, the loop is stopped and nothing is proved
-    until the next `start`.
+    state is proved to be in the certificate's safe set S at this step, `reason` why not. The loop cannot see that the
+    clock misses a step, that packets carry wrong stamps, or, unless it is told or hears `echoes`, that the actuator
+    applies something else. Where `start`, `receive` or `decide` is interrupted, the loop is stopped and nothing is
+    proved until the next `start`. It can be pickled between two calls; several threads may not use one loop at once.
 
-    Behind a downlink that is late or loses commands, send `command` after each `decide` instead, and let an
-    `ncs_gym.Actuator` apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect
-    `input_delay` steps later; estimate and error shape belong to that time.
-
-    Where the channel takes samples on request (docs/requests.md), `request` says after each `decide` whether the sample
-    of the next step is to be taken; behind a downlink commands say it, and the actuator's `requested`.
+    Behind a downlink that is late or loses commands, send `command` after each `decide`, and let an `ncs_gym.Actuator`
+    apply what it holds (docs/contracts.md, "Both directions"). What is decided takes effect `input_delay` steps later;
+    estimate and error shape belong to that time. Where the channel takes samples on request (docs/requests.md),
+    `request` says after each `decide` whether the sample of the next step is to be taken; behind a downlink commands
+    say it.
 
     Args:
-        certificate: Verified exactly here.
+        certificate: Verified exactly here; gives the contract and the error sets.
         plant: The plant it was made for.
-        channel: Its longest delay and quantization step count, its losses do not. Packets that are older are discarded
-            and counted; what is sent after `decide` and received at the next step is one step late.
+        channel: Its longest delay and quantization step count, its losses do not. Older packets are discarded and
+            counted; what is sent after `decide` and received at the next step is one step late.
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
         downlink: The channel from here to the actuator; None if what is decided is applied at once.
         downlink_contract: What is assumed of it; by default what its settings guarantee.
-        echo_age: How many steps the newest echo of the actuator may be old: beyond it, and for the rest of the episode
-            once an echo contradicts what was decided, nothing is proved. None if there are no echoes: then what is
-            said holds if everything that is decided is applied.
         on_unproved: What `start` and `receive` do, once per episode and reason, where the state is not proved safe:
             "warn" with a `GuaranteeLostWarning`, "raise" a `GuaranteeLostError`, "ignore" if you read `guaranteed`.
             When one is raised, the call has come to its end: go on with `decide`.
+        echo_age: How many steps the newest echo of the actuator may be old: beyond it, and for the rest of the episode
+            once an echo contradicts what was decided, nothing is proved. None if there are no echoes.
 
     Attributes:
         filter: Makes the decisions.
@@ -160,11 +146,10 @@ class SafeLoop(CopiedWhole):
     def start(self, x_hat0: Any, initial_set: Ellipsoid | np.ndarray | None = None) -> None:
         """Starts an episode at step 0; also how one is begun anew after the guarantee was lost.
 
-        It is a claim: that the error of x_hat0 lies in `plant.initial_error`. Packets of earlier episodes are discarded
-        from now on: `episode` is the number of the new one.
+        Packets of earlier episodes are discarded from now on: `episode` is the number of the new one.
 
         Args:
-            x_hat0: First estimate, shape (n,), whose error lies in `plant.initial_error`.
+            x_hat0: First estimate, shape (n,). You claim that its error lies in `plant.initial_error`.
             initial_set: What the state is known to lie in besides, an ellipsoid or the state itself, shape (n,). It
                 counts where x_hat0 alone does not prove that the state is in S (in mode "lookahead": in the box).
 
@@ -197,10 +182,8 @@ class SafeLoop(CopiedWhole):
     def receive(self, packets: Iterable[Packet] = (), applied: Any = None, echoes: Iterable[Echo] = ()) -> np.ndarray:
         """Returns the estimate at this control step, shape (n,): predicted from the last one, then corrected.
 
-        Behind a downlink it is that of the step at which the input decided next takes effect.
-
-        At step 0 it is the first estimate: packets from before the first step are of no use, nor is a later sample of
-        step 0, which the first estimate stands for. Two values of a sample that was used end the guarantee of the
+        Behind a downlink it is that of the step at which the input decided next takes effect. At step 0 it is the first
+        estimate, which stands for a sample of that step. Two values of a sample that was used end the guarantee of the
         episode.
 
         Args:
@@ -209,8 +192,8 @@ class SafeLoop(CopiedWhole):
             applied: What the actuator applied since the last decision, shape (m,), if that may be something else than
                 was decided for this time. If it is, the estimate follows it and the guarantee ends; if it is no finite
                 input, the estimate follows the decision.
-            echoes: What the actuator says that it has applied (`Actuator.echo`), where `echo_age` is given: as many as
-                arrived, in any order.
+            echoes: What the actuator says that it has applied (`Actuator.echo`), where `echo_age` is given, in any
+                order.
 
         Raises:
             RuntimeError: If `start` was not called, or nothing was decided since the last call.
@@ -244,11 +227,10 @@ class SafeLoop(CopiedWhole):
         before, oldest = self._discarded, self._estimator.channel.longest_delay
         self._discarded = before.with_those_of(arrived, self.steps, self.episode, oldest)
         self._phase = _Phase.RECEIVED
-        estimate = self.estimate
         if self._discarded != before:
             self._tell_of_discarded(before)
         self._guard.lost.tell_of(self.reason)
-        return estimate
+        return self.estimate
 
     @np.errstate(all="ignore")
     def decide(self, proposed: Any, *, ask: bool = False) -> Decision:
@@ -257,8 +239,8 @@ class SafeLoop(CopiedWhole):
         Args:
             proposed: Your controller's input, shape (m,) or a number if m = 1 [physical units]; clipped to the limits.
                 What is no finite input is replaced by u = K x_hat, with a warning unless it is None.
-            ask: Whether your controller asks for a sample, where samples are on request: that of the next step, behind
-                a downlink that of c steps later. See `request`.
+            ask: Whether your controller asks for the sample of the next step, behind a downlink of c steps later, where
+                samples are on request.
 
         Raises:
             RuntimeError: If `start` was not called, or this step was decided already.
@@ -306,7 +288,7 @@ class SafeLoop(CopiedWhole):
         *,
         ask: bool = False,
     ) -> Decision:
-        """Returns the decision at this control step: `receive`, then `decide`, which is left if that is interrupted.
+        """Returns the decision at this control step: `receive`, then `decide`, for proposals that need no estimate.
 
         Raises:
             GuaranteeLostError: As from `receive`; `decide` is left then.
@@ -339,8 +321,8 @@ class SafeLoop(CopiedWhole):
             return NOT_STARTED
         if self._applied.is_other:
             return LATE_INPUT if self._input_delay else OTHER_INPUT
-        if (reason := self._guard.reason) or self._applied.is_confirmed(self.steps):
-            return reason
+        if (code := self._guard.code) or self._applied.is_confirmed(self.steps):
+            return EXPLANATIONS[code]
         return OTHER_EPISODE if self._applied.hears_of_others(self.steps) else NOT_CONFIRMED
 
     @property
@@ -350,16 +332,19 @@ class SafeLoop(CopiedWhole):
 
     @property
     def estimate(self) -> np.ndarray:
-        """x_hat at this control step, shape (n,).
+        """x_hat at this control step, shape (n,); behind a downlink when the next decision takes effect.
 
-        Behind a downlink it is that of the step at which the next decision takes effect.
+        Raises:
+            RuntimeError: If no episode is under way.
         """
-        return self._predicted()[0].copy()
+        self._require_started()
+        return self._guard.belief.estimate.copy()
 
     @property
     def error_shape(self) -> np.ndarray:
         """Sigma_k, shape (n, n): x_hat - x lies in E(Sigma_k), at the step of the estimate."""
-        return self._predicted()[1].copy()
+        self._require_started()
+        return self._guard.belief.error_shape.copy()
 
     @property
     def steps(self) -> int:
@@ -382,7 +367,6 @@ class SafeLoop(CopiedWhole):
         return self._discarded
 
     def _tell_of_discarded(self, before: DiscardedPackets) -> None:
-        """Warns once of every reason for which packets were discarded in this call."""
         oldest = self._estimator.channel.longest_delay
         texts = {
             "too_late": f"it is older than {counted(oldest, 'step')}, the longest delay of the channel of this loop",
@@ -404,17 +388,12 @@ class SafeLoop(CopiedWhole):
         return self._phase
 
     def _belief(self, applied: np.ndarray | None) -> Belief:
-        """Returns what is known now, given the input applied in the last step; None if it is not known."""
+        """Returns what is known now; `applied` is the input of the last step, None if it is not known."""
         estimator = self._estimator
         estimate, number = estimator.numbered(self._inputs.pending[: self._input_delay])
         applied = np.full(self._filter.plant.m, np.nan) if applied is None else applied
         seen = estimate, number, estimator.table, estimator.age, estimator.alarm, estimator.damaged, False
         return Belief(*seen, applied, self._decided, self.steps)
-
-    def _predicted(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns estimate and error shape of the time at which the next input takes effect."""
-        estimate, number = self._estimator.numbered(self._inputs.pending[: self._input_delay])
-        return estimate, self._estimator.table.shape(number)
 
 
 def _as_input(given: Any, shape: tuple[int, ...]) -> np.ndarray | None:

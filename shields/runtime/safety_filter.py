@@ -55,7 +55,7 @@ class SafetyFilter(ReadOnlyArrays):
             proposed and says whether "switch" would have; it protects nothing. "lookahead" lets an input pass after
             which a certified plan keeps the state in the box until it is in S, and stores that plan
             (docs/lookahead.md).
-        horizon: Longest plan of mode "lookahead", in steps; None is 6. Other modes take none.
+        horizon: Longest plan of mode "lookahead", 1 to 50 steps; None is 6. Other modes take none.
 
     Attributes:
         test: The test of an input.
@@ -63,8 +63,7 @@ class SafetyFilter(ReadOnlyArrays):
 
     Raises:
         CertificateError: If the certificate does not verify for the plant, or float64 is too coarse for it.
-        ValueError: If the mode is unknown, or "boundary" for more than twelve inputs, or the horizon is no whole number
-            from 1 to 50, or it is given for another mode than "lookahead".
+        ValueError: If the mode is unknown, or "boundary" for more than twelve inputs, or the horizon is wrong.
     """
 
     certificate: Certificate
@@ -132,14 +131,11 @@ class SafetyFilter(ReadOnlyArrays):
             stored: In mode "lookahead" the `plan` of the last decision, shape (k, m), if its input was applied and one
                 step has passed since. What is no plan of at most `horizon` inputs within the limits counts as none.
         """
-        x_hat, proposed = _as_array(estimate).copy(), _as_array(input_proposed).copy()  # read once
-        errors = error_shape if isinstance(error_shape, PredictedErrors) else self.errors_of(error_shape)
-        if (x_hat.shape, proposed.shape) != self._single:
-            if 0 in (x_hat.ndim, proposed.ndim):  # numbers are vectors of one entry
-                pairs = (estimate, x_hat), (input_proposed, proposed)
-                one, other = (given if array.ndim else array[None] for given, array in pairs)
-                return self.decide(one, errors, other, stored)
-        elif (decision := self.decide_alone(x_hat, errors, proposed, stored)) is not None:
+        # Read once; numbers are vectors of one entry.
+        x_hat, proposed = (np.atleast_1d(_as_array(each)).copy() for each in (estimate, input_proposed))
+        errors = self.errors_of(error_shape)
+        alone = (x_hat.shape, proposed.shape) == self._single
+        if alone and (decision := self.decide_alone(x_hat, errors, proposed, stored)) is not None:
             return decision
         n, m = self.plant.n, self.plant.m
         plans = self._no_plan if self.lookahead is None else self.lookahead.as_stored(stored)
@@ -222,12 +218,11 @@ class SafetyFilter(ReadOnlyArrays):
             error_shapes: Sigma_k, shape (N, n, n), or (n, n) for all.
             proposals: Inputs, shape (N, m) [physical units].
             stored: In mode "lookahead" the `plan` of the last decisions, shape (N, horizon, m); None for none. What is
-                no plan counts as none, as for single ones.
+                no plan counts as none.
 
         Returns:
-            A `Decision` of arrays, empty ones for N = 0: `input` of shape (N, m), `plan` (N, horizon, m), `reason` of
-            texts, and truth values and margins of shape (N,). Rows that are not finite are "invalid", as single ones
-            are.
+            A `Decision` of arrays: `input` of shape (N, m), `plan` (N, horizon, m), `reason` of texts, and truth values
+            and margins of shape (N,). Rows that are not finite are "invalid".
 
         Raises:
             ValueError: If an argument does not consist of numbers of these shapes.
@@ -267,7 +262,7 @@ class SafetyFilter(ReadOnlyArrays):
     def errors_of(self, error_shape: Any) -> PredictedErrors:
         """Returns what is known of one error shape, (n, n), without a last axis, read-only; itself if it is that.
 
-        It is remembered, since shapes recur: all loops of this filter share it, in whatever threads they run.
+        It is remembered, since shapes recur.
         """
         if isinstance(error_shape, PredictedErrors):
             return error_shape
@@ -298,17 +293,6 @@ class SafetyFilter(ReadOnlyArrays):
         """Returns whether estimate and error shape prove that x is in the certificate's safe set."""
         x_hat, errors = _as_array(estimate), self.errors_of(error_shape)
         return x_hat.shape == (self.plant.n,) and bool(self.test.knows_inside(x_hat, errors, MARGIN))
-
-    def fallback_input(self, estimate: np.ndarray) -> np.ndarray:
-        """Returns K x_hat, shape (m,), clipped to the limits and rounded to what a float32 action can express.
-
-        Raises:
-            ValueError: If the estimate is not finite or does not have shape (n,), or K x_hat overflows.
-        """
-        gained = self._gained(_as_column(_as_array(estimate), self.plant.n))[:, 0]
-        if not np.isfinite(gained).all():
-            raise ValueError(f"the estimate must be finite with shape ({self.plant.n},), got {shown(estimate)}")
-        return gained
 
     def _project(self, decided: Decision, some: np.ndarray, sets: ReachableSets) -> None:
         """Puts the closest input that passes, where there is one, in the place of some of those decided."""
@@ -352,8 +336,7 @@ def plan_horizon(mode: str, horizon: int | None) -> int | None:
     """Returns the length of the longest plans of a mode [steps]; None for those that plan nothing.
 
     Raises:
-        ValueError: If there is no such mode, or a horizon is given for one that plans nothing, or is no whole number in
-            its range.
+        ValueError: If there is no such mode, or the horizon is wrong.
     """
     if not (isinstance(mode, str) and mode in MODES):
         raise ValueError(f"mode must be one of {list(MODES)}, got {shown(mode)}")
@@ -380,9 +363,6 @@ class NumberedErrors:
     """What a filter knows of the error shapes of estimators, by the numbers that these have for them.
 
     A number belongs to a table, in which it never changes its meaning; with another table all is looked up anew.
-
-    Args:
-        safety_filter: What knows.
     """
 
     def __init__(self, safety_filter: SafetyFilter) -> None:

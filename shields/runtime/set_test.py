@@ -127,7 +127,7 @@ class SetTest:
 
         Args:
             shapes: Sigma_k, shape (k, n, n).
-            certified_shapes: Shapes of the certified error sets, shape (l, n, n).
+            certified_shapes: Those of the certified error sets, shape (l, n, n).
         """
         symmetric, usable, inside = judged_shapes(shapes, certified_shapes)
         half_widths = np.sqrt(np.diagonal(symmetric, axis1=1, axis2=2))
@@ -169,11 +169,7 @@ class SetTest:
         return ReachableSets(self, estimates, center, errors.weighting, errors.row_limits, rounding, radius)
 
     def margins_alone(self, estimate: np.ndarray, errors: PredictedErrors, u: np.ndarray) -> tuple[float, float]:
-        """Returns `ReachableSets.margins` of one estimate, shape (n,), one error shape and one input, shape (m,).
-
-        By the same formulas without the axis of environments, in a fifth of the time. Both are NaN where nothing is
-        known and where no input passes.
-        """
+        """Returns `ReachableSets.margins` of one estimate, error shape and input, (m,), in a fifth of the time."""
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         radius = errors.radius - rounding
         if not radius >= SMALLEST_RADIUS:  # neither NaN
@@ -206,10 +202,7 @@ class SetTest:
         return u
 
     def closest_on_rows(self, inputs: np.ndarray, offset: np.ndarray, row_limits: np.ndarray) -> np.ndarray:
-        """Returns the inputs within the limits closest to given ones, (m, N), with |offset + rows u| <= row_limits.
-
-        The offset is that from the middle.
-        """
+        """Returns the inputs within the limits closest to given ones, (m, N), with |offset + rows u| <= row_limits."""
         count, (middle, half) = inputs.shape[1], self._input_range
         offset = np.concatenate([offset, np.repeat(-middle, count, axis=1)])
         bounds = np.concatenate([row_limits, np.repeat(half, count, axis=1)])
@@ -243,8 +236,8 @@ class ReachableSets(NamedTuple):
     """Where next states lie, for each of N environments.
 
     Errors, disturbance and rounding are taken off the limits first. What is left for c = A x_hat + B u is the `radius`,
-    of rows the `row_limits`; what an input leaves of that is its margin, which is negative where it asks for more. The
-    test margin, the least of radius - |T G c| and of row limit - |g c - middle|, decides: x+ is in the set unless it is
+    of rows the `row_limits`; what an input leaves of that is its margin, negative where it asks for more. The test
+    margin, the least of radius - |T G c| and of row limit - |g c - middle|, decides: x+ is in the set unless it is
     negative. The reported margin (`Decision.margin`) has no T, and is at most that.
 
     Attributes:
@@ -252,8 +245,8 @@ class ReachableSets(NamedTuple):
         estimates: x_hat, shape (n, N).
         center: G A x_hat of the cone, shape (k, N).
         weighting: T of `PredictedErrors`, shape (k, k, N).
-        row_limits: Largest |g c - middle| that passes, shape (r, N), before
-        rounding: what they lose by rounding, shape (N,); NaN if nothing is known.
+        row_limits: Largest |g c - middle| that passes, shape (r, N), before rounding.
+        rounding: What they lose by it, shape (N,); NaN if nothing is known.
         radius: That of the cone, else the least row limit, less rounding, shape (N,); no input passes if it is not
             positive. NaN if nothing is known.
     """
@@ -267,7 +260,7 @@ class ReachableSets(NamedTuple):
     radius: np.ndarray
 
     def some(self, chosen: np.ndarray) -> ReachableSets:
-        """Returns the sets of some environments, given by their indices."""
+        """Returns those of some environments, given by their indices."""
         return ReachableSets(self.test, *(array.take(chosen, axis=-1) for array in self[1:]))
 
     def margins(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -319,8 +312,7 @@ class ReachableSets(NamedTuple):
         """Returns the inputs within the limits, (m, N), closest to given ones with this test margin, else NaN.
 
         With cone and rows a single input is in two intervals, and the closest point of one to the closest of the other
-        is that of both. Of several inputs projections alternate: the result need not be the closest, nor pass, and the
-        caller tests it.
+        is that of both. Of several inputs projections alternate: the caller tests the result.
         """
         cone, rows = self.test.cone, len(self.test.joint)
         for _ in range(ALTERNATIONS if cone and rows and len(inputs) > 1 else 1):
@@ -350,8 +342,7 @@ class ReachableSets(NamedTuple):
 class PredictedErrors(NamedTuple):
     """What follows from error shapes alone; the last axis counts them (no such axis: a single one).
 
-    The norm of S is weighted, rows are judged one by one; what a test does not need has no entries. Radius,
-    half_widths, own and row_limits are NaN for an unusable shape.
+    Radius, half_widths, own and row_limits are NaN for an unusable shape; what a test does not need has no entries.
 
     Attributes:
         weighting: T with |T z|^2 = sum_i (1-h) h / (h - p_i) z_i^2 along the axes of Sigma_pred, shape (n, n, k).
@@ -395,9 +386,9 @@ class PredictedErrors(NamedTuple):
 
 
 def judged_shapes(shapes: np.ndarray, certified_shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns error shapes made symmetric, which are usable, and which lie inside a certified error set.
+    """Returns error shapes (k, n, n) made symmetric, which are usable, and which lie inside a certified error set.
 
-    Shapes are (k, n, n), (k,) and (k,). The identity stands for an unusable one.
+    The identity stands for an unusable one.
     """
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
     usable = _are_shapes(symmetric)
@@ -480,11 +471,7 @@ def certificate_test(certificate: Certificate, plant: LinearPlant) -> SetTest:
 
 
 def ellipsoid_test(L: np.ndarray, plant: LinearPlant) -> SetTest:
-    """Returns the test of S = E(L).
-
-    Raises:
-        CertificateError: If S is so thin that no norm computed in float64 provably describes it.
-    """
+    """Returns the test of S = E(L); raises CertificateError as `certificate_test` does."""
     return SetTest(plant, certified_root(L), np.empty((0, plant.n)), np.empty(0), np.empty(0))
 
 
@@ -507,12 +494,9 @@ def certified_root(L: np.ndarray) -> np.ndarray:
 
 
 def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
-    """Raises unless float64 computes K x_hat on S, or the polytope, more accurately than the conditions allow for.
+    """Raises CertificateError unless float64 computes K x_hat on the safe set more accurately than is allowed for.
 
     D_u allows a shift by 2^-24 u_max, twice what rounding an action to float32 does; the other half is for this.
-
-    Raises:
-        CertificateError: If it does not.
     """
     extent = np.sqrt(np.diag(certificate.L))
     if certificate.polytope is not None:

@@ -65,8 +65,7 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
 def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
     """Returns whether all starts in an ellipsoid, or one state, shape (n,), lie in the safe box, in exact arithmetic.
 
-    E(P) does exactly if c_i P c_i' is at most the square of the nearer end for all rows. Where the box counts between
-    samples, they have to lie in a smaller one, in which disturbances cannot leave it.
+    Where the box counts between samples, they have to lie in a smaller one, in which disturbances cannot leave it.
     """
     between = rows_within_step(plant)
     return _between(between.at_samples, between.low_at_samples, between.high_at_samples, initial)
@@ -126,9 +125,9 @@ def starts_known(
 
 
 def known_inside(safety_filter: SafetyFilter, known: StartKnown, estimate: np.ndarray, errors: PredictedErrors) -> bool:
-    """Returns whether one of the states x_0 .. x_{c-1} is known to be in the safe set; in mode "lookahead" in the box.
+    """Returns whether one of x_0 .. x_{c-1}, after which the input is zero, is known to be in the safe set, or box.
 
-    Either from where starts are possible, or from its estimate, shape (n,). The input that acts then is zero.
+    Either from where starts are possible, or from its estimate, shape (n,).
     """
     if known.in_box:
         return True
@@ -143,9 +142,9 @@ def first_store(
 ) -> tuple[np.ndarray, bool]:
     """Returns what is stored before the first decision, shape (k, m), and whether the state is proved safe.
 
-    The state is that at which the first decision takes effect, without a downlink the start. It is proved safe where it
-    is known to be in the safe set; in mode "lookahead" also where it is known to be in the box, by what starts are
-    possible or by the estimate, shape (n,), and a first plan is certified.
+    The state is that at which the first decision takes effect. It is proved safe where it is known to be in the safe
+    set; in mode "lookahead" also where it is known to be in the box, by what starts are possible or by the estimate,
+    shape (n,), and a first plan is certified.
     """
     inside = known.in_safe_set or safety_filter.test.knows_inside(estimate, errors, MARGIN)
     if inside:

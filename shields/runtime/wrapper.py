@@ -107,12 +107,11 @@ class SafetyShield(_Shield, gym.Wrapper):
     input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. S is the
     certificate's safe set: its polytope, or its ellipsoid if it has none. From a start in S the true state then stays
     in S for ever, for any policy, disturbance and channel within the assumptions; `info["shield_guaranteed"]` says
-    whether they still hold as far as can be seen. "boundary" trusts the agent only where no input at all could leave S.
-    "monitor" never changes the action and counts what "switch" would have done.
+    whether they still hold as far as can be seen. `SafetyFilter` has the other modes.
 
-    The wrapper installs a `Guard` in the environment, where nothing comes between what is decided and what is applied:
+    The wrapper installs a guard in the environment, where nothing comes between what is decided and what is applied:
     other wrappers may stand on either side of it, and the environment stays guarded by whatever name it is called from
-    then on. Whoever wants it without a shield, too, makes another one.
+    then on. If you want it without a shield, too, make another one.
 
     ## Info (added to the environment's, at reset too)
     | key | shape or type | unit | meaning |
@@ -127,20 +126,15 @@ class SafetyShield(_Shield, gym.Wrapper):
     | `episode_guaranteed` | float | - | share of the states of this episode, the first included, proved as now |
     | `shield_plan_length` | int | steps | in mode "lookahead" only: number of inputs stored for later steps |
 
-    In mode "lookahead" an input passes too if a certified plan that begins with it keeps the state in the box until it
-    is in S; `shield_guaranteed` then says whether the state is proved to be in the box now and to stay there.
-
-    Where the plant models another process, that is proved of the process only if `plant.remainder.proved`; else it
-    rests on the assumption that sampling found the largest remainder (docs/beyond_linear.md).
+    Where the plant models another process, all is proved of the process only if `plant.remainder.proved`; else it rests
+    on the assumption that sampling found the largest remainder (docs/beyond_linear.md).
 
     Args:
         env: An `NCSEnv`, possibly wrapped.
         certificate: A certificate, its `document`, or the path of its file; None takes the one that
-            `shields.certificate_for` has for the environment's plant and contract. A spec holds the document, so that
-            it is JSON.
+            `shields.certificate_for` has for the environment's plant and contract.
         mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
-        penalty: Subtracted from the environment's reward per intervention counted, >= 0; it may be changed while an
-            agent is trained.
+        penalty: Subtracted from the environment's reward per intervention counted, >= 0.
         horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
         on_unproved: What reset and step do, once per episode and reason, where x in S is not proved: "warn" with a
             `GuaranteeLostWarning`, "raise" a `GuaranteeLostError` after the step, "ignore" if you read the infos.
@@ -157,18 +151,16 @@ class SafetyShield(_Shield, gym.Wrapper):
 class VectorSafetyShield(_Shield, AroundEnvironments, VectorWrapper):
     """`SafetyShield` for an `NCSVectorEnv`: the same decisions, proof and info keys, in batches.
 
-    Every info value has N as its first axis; `shield_reason` is an array of str objects, read-only while
-    all proofs hold. A step that only resets an environment counts no intervention.
+    Every info value has N as its first axis. A step that only resets an environment counts no intervention.
+    Environments that lose the guarantee in the same step for the same reason are told of once.
 
     Args:
         env: An `NCSVectorEnv`, possibly wrapped.
-        certificate: A certificate, its `document`, or the path of its file; None synthesizes one for the environment's
-            plant and contract, once per process.
-        mode: "project", "lookahead", "switch", "boundary" or "monitor"; see `SafetyFilter`.
-        penalty: Subtracted from the environments' rewards per intervention counted, >= 0.
-        horizon: Longest plan of mode "lookahead", in steps; see `SafetyFilter`.
-        on_unproved: "ignore", "warn" or "raise"; see `SafetyShield`. Environments that lose the guarantee in the same
-            step for the same reason are told of once.
+        certificate: See `SafetyShield`.
+        mode: See `SafetyShield`.
+        penalty: See `SafetyShield`.
+        horizon: See `SafetyShield`.
+        on_unproved: See `SafetyShield`.
 
     Raises:
         CertificateError: If the certificate does not verify for the environment's plant.

@@ -48,6 +48,26 @@ def test_channel_of_an_option_lasts_one_episode_under_stable_baselines3_alone_an
         assert episodes(SB3VecEnv(vector, info_keywords=("channel_loss",))) == theirs
 
 
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_what_is_drawn_from_changes_for_episodes_that_begin_by_themselves_and_infos_of_their_starts_say_so(mode):
+    envs = gym.make_vec(ID, num_envs=2, max_episode_steps=4, autoreset_mode=mode)
+    draws = VectorRandomChannel(envs, [Channel(loss=0.1)])
+    env = SB3VecEnv(draws, info_keywords=("channel_loss",))
+    env.seed(0)
+    env.reset()
+    draws.draw_from(lambda rng: {"loss": 0.5})
+    seen = []
+    for _ in range(13):
+        observation, _, _, infos = env.step(np.zeros((2, 1), np.float32))
+        seen.append(infos[1]["channel_loss"])
+        if "episode" in infos[1]:
+            assert env.reset_infos[1]["channel_loss"] == 0.5
+            np.testing.assert_allclose(observation[1][:2], env.reset_infos[1]["estimate"], rtol=1e-6)
+    assert seen == [0.1] * 4 + [0.5] * 9
+    with pytest.raises(AttributeError, match=r"use vec_env\.vector_env"):
+        env.env_method("draw_from", [Channel()])
+
+
 def test_specification_of_vector_wrappers_makes_no_environments_without_them():
     envs = gym.make_vec(ID, num_envs=2)
     for other in (gym.make_vec(CLASSIC, num_envs=2), gym.make_vec(ID, num_envs=2, vectorization_mode="sync")):

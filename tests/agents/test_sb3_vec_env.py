@@ -124,7 +124,7 @@ def test_attributes():
     assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False] * 3
     assert env.get_images() == [None] * 3
     for call in (
-        *(partial(env.get_attr, name) for name in ("nothing", "steps", "known")),
+        *(partial(env.get_attr, name) for name in ("nothing", "steps", "known", "start", "episode_channel")),
         lambda: env.set_attr("plant", 1),
         lambda: env.env_method("reset"),
     ):

@@ -1,9 +1,7 @@
-"""Random sequences of steps, resets and bad actions, and random stacks of wrappers around and inside a shield."""
+"""Random sequences of steps, resets and bad actions."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import wrappers
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -76,80 +74,3 @@ def test_refused_actions_and_resets_move_nothing(kind, certificate, loaded, move
     (one, other), count = pair(kind, certificate, loaded)
     good = [move for move in moves if not move[0].startswith("bad")]
     assert played(one, moves, count) == played(other, good, count)
-
-
-# Wrappers that look, those that change what is done, and those that do so without saying it.
-HARMLESS = {
-    "TimeLimit": lambda env: wrappers.TimeLimit(env, 15),
-    "OrderEnforcing": wrappers.OrderEnforcing,
-    "PassiveEnvChecker": wrappers.PassiveEnvChecker,
-    # Under a key of its own: a second one of the same key ends in an assertion of gymnasium.
-    "RecordEpisodeStatistics": lambda env: wrappers.RecordEpisodeStatistics(env, stats_key=f"episode {id(env)}"),
-    "FlattenObservation": wrappers.FlattenObservation,
-    "NormalizeObservation": wrappers.NormalizeObservation,
-    "NormalizeReward": wrappers.NormalizeReward,
-    "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 2),
-    "DelayObservation": lambda env: wrappers.DelayObservation(env, 1),
-    "TransformReward": lambda env: wrappers.TransformReward(env, lambda reward: 2.0 * reward - 1.0),
-    "ClipReward": lambda env: wrappers.ClipReward(env, -1.0, 0.0),
-    "TransformObservation": lambda env: wrappers.TransformObservation(env, lambda seen: 0.0 * seen, None),
-}
-CHANGING = {
-    "ClipAction": wrappers.ClipAction,
-    "RescaleAction": lambda env: wrappers.RescaleAction(env, np.float32(-2.0), np.float32(5.0)),
-    "TransformAction": lambda env: wrappers.TransformAction(env, lambda action: -action, None),
-    "StickyAction": lambda env: wrappers.StickyAction(env, 0.5),
-    "RepeatAction": lambda env: wrappers.RepeatAction(env, 2),
-    "MaxAndSkip": lambda env: wrappers.MaxAndSkipObservation(env, 2),
-    "Autoreset": wrappers.Autoreset,
-}
-
-
-class Meddler(gym.Wrapper):
-    """A wrapper of nobody's: changes actions, steps twice or resets by itself, without saying so."""
-
-    def __init__(self, env, what):
-        super().__init__(env)
-        self.what = what
-
-    def step(self, action):
-        if self.what == "twice":
-            self.env.step(action)
-        if self.what == "resets":
-            self.env.reset(options={"state": [0.99, 0.0]})
-        return self.env.step(-np.asarray(action) if self.what == "turns" else action)
-
-
-MEDDLERS = {what: lambda env, what=what: Meddler(env, what) for what in ("twice", "resets", "turns")}
-ALL = HARMLESS | CHANGING | MEDDLERS
-STACK = st.lists(st.sampled_from(sorted(ALL)), max_size=4)
-
-
-def stacked(env, names):
-    for name in names:
-        env = ALL[name](env)
-    return env
-
-
-@given(
-    inside=STACK,
-    outside=STACK,
-    mode=st.sampled_from(["project", "switch", "boundary"]),
-    start=st.sampled_from([None, *STARTS]),
-    seed=st.integers(0, 1000),
-)
-@examples(12)
-def test_whatever_stands_around_a_guard_its_proof_is_right(certificate, loaded, inside, outside, mode, start, seed):
-    """Where the shield says guaranteed the true state is in S, and it says so all along from a start in S."""
-    bare = loop_env(loaded, Channel(0.5, quantization_step=0.05, delay=1), disturbance="adversarial")
-    env = stacked(safety_shield(stacked(bare, inside), certificate, mode), outside)
-    rng, claims = np.random.default_rng(seed), 0
-    env.reset(seed=seed, options=None if start is None else {"state": start})
-    for _ in range(25):
-        _, _, terminated, truncated, _ = env.step(rng.uniform(0.0, 1.5, 1).astype(np.float32))
-        if not bare.guard.reason:
-            claims += 1
-            assert certificate.safe_set.gauge(bare.state) <= 1.0
-        if terminated or truncated:
-            env.reset()
-    assert claims == 25 or start == STARTS[-1]

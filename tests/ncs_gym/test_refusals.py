@@ -222,7 +222,7 @@ ENVIRONMENTS = [
     *wrong(
         partial(gym.make_vec, TRUCK),
         {
-            "rendered_env": [3],
+            "render_mode": ["rgb_array"],
             "autoreset_mode": ["Later"],
             "horizon": [0],
         },
@@ -262,7 +262,7 @@ REQUESTS = [
     lambda: NCSVectorEnv(3, plant=UNSTABLE, **ASKED).request([True]),
     lambda: NCSEnv(UNSTABLE, **ASKED).reset(options={"channel": Channel()}),
     lambda: NCSEnv(PLANT).reset(options={"channel": Channel(on_request=True)}),
-    lambda: NCSVectorEnv(2, plant=PLANT, channel=[Channel(), Channel(on_request=True)]),
+    lambda: NCSVectorEnv(2, plant=PLANT, channel=[Channel(), Channel()]),
     lambda: RequestActions(gym.make(POLE)),
     lambda: RequestActions(gym.make("CartPole-v1")),
     lambda: RequestActions(gym.make(POLE, **ASKED), -1.0),
@@ -477,14 +477,12 @@ OTHER_ERRORS = [
     (partial(NCSEnv, PLANT, render_mode="ansi"), RenderModeError),
     (partial(NCSEnv, PLANT, render_mode="ansi"), TypeError),  # as SB3 expects
     (partial(NCSEnv, UNSTABLE, Channel(loss=0.1)), UnstablePlantError),
-    (partial(NCSVectorEnv, 2, plant=UNSTABLE, channel=[Channel(), Channel(loss=0.1)]), UnstablePlantError),
     (partial(register_plant, "Plants/Pole-v0", UNSTABLE, channel=Channel(loss=0.1)), UnstablePlantError),
     (partial(certified_error_set, UNSTABLE), UnstablePlantError),
     (lambda: NCSEnv(PLANT).step(np.zeros(1)), ResetNeeded),
     (lambda: NCSVectorEnv(2, plant=PLANT).step(np.zeros((2, 1))), ResetNeeded),
     (lambda: NCSVectorEnv(2, plant=PLANT).reset(options={"reset_mask": np.array([True, False])}), ResetNeeded),
     (lambda: NCSEnv(PLANT, render_mode="rgb_array").render(), ResetNeeded),
-    (lambda: gym.make_vec(TRUCK, num_envs=3, render_mode="rgb_array").render(), ResetNeeded),
     (partial(register_plant, "Plants/T-v0", PLANT, chanel=Channel()), TypeError),
     (partial(LinearPlant, PLAIN, ROOM_LIMITS, BOUNDS, sensor_bonud=0.1), TypeError),
     (partial(Bounds, 0.1, 0.1), TypeError),

@@ -12,3 +12,8 @@ def edge_of(passes: Callable[[float], bool], high: float, tries: int = 60) -> fl
         middle = 0.5 * (low + high)
         low, high = (middle, high) if passes(middle) else (low, middle)
     return low
+
+
+def gained(shield, estimate):
+    """K x_hat, shape (m,), as a filter applies it."""
+    return shield._gained(estimate[:, None])[:, 0]

@@ -6,7 +6,6 @@ this package imports the solver.
 """
 
 from shields.runtime.backup_plans.plan_check import PlanTest, Prediction
-from shields.runtime.backup_plans.plan_search import Planner, Plans
 from shields.runtime.backup_plans.stored_plans import Lookahead
 
-__all__ = ["Lookahead", "PlanTest", "Planner", "Plans", "Prediction"]
+__all__ = ["Lookahead", "PlanTest", "Prediction"]

@@ -1,7 +1,7 @@
 """Which backup plans are certified: inputs that keep every possible state in the box and end in the safe set, S or P.
 
 `Prediction` says what the plant does within N steps, `Tightening` how far errors and disturbances reach around that,
-which depends on Sigma_k alone, and `PlanTest` decides. Arrays count environments on their first axis.
+and `PlanTest` decides. Arrays count environments on their first axis.
 """
 
 from __future__ import annotations
@@ -39,9 +39,6 @@ class PlanTest:
     Args:
         prediction: Of the plant.
         margin: By which the test must be passed, in units of the box and of S or P.
-
-    Attributes:
-        prediction: The same.
     """
 
     def __init__(self, prediction: Prediction, margin: float) -> None:
@@ -84,13 +81,11 @@ class PlanTest:
         return self._row_limits(estimates, tightening, slice(None)), self._radius(estimates, tightening)
 
     def _row_limits(self, estimates: np.ndarray, tightening: Tightening, rows: slice) -> np.ndarray:
-        """Returns what `limits_at` says of some rows."""
         limits, rounding = tightening.row_limits[:, :, rows], self._row_rounding[:, rows]
         size = np.abs(estimates) @ rounding.reshape(-1, estimates.shape[1]).T
         return limits - size.reshape(limits.shape) - self._margin
 
     def _radius(self, estimates: np.ndarray, tightening: Tightening) -> np.ndarray:
-        """Returns the same of the cone."""
         radius = tightening.radius - np.abs(estimates) @ self._end_rounding  # may be far below zero
         return np.where(radius >= SMALLEST_RADIUS, radius - self._margin, np.nan)
 
@@ -186,8 +181,7 @@ class Prediction:
         size_forced: sum_{i<j} |A|^i |B| |u| for the largest |u| within the limits, shape (N, n).
         rounding: Relative rounding after j steps, shape (N,).
         cone: The root of S, shape (n, n); of shape (0, n) where plans end in P.
-        ends: Whether c_j + E(Sigma_pred,j) lies in S, for N lengths of a plan; none where plans end in P, whose rows
-            decide.
+        ends: Whether c_j + E(Sigma_pred,j) lies in S, for N lengths of a plan; none where plans end in P.
     """
 
     def __init__(self, first: SetTest, steps: int) -> None:
@@ -232,10 +226,6 @@ class PlanGrid:
 
     There are none, g = 0, where the box counts at samples alone.
 
-    Args:
-        prediction: Of the plant, without its grid.
-        test: Rows of one step.
-
     Attributes:
         free: Rows on x_hat, shape (N, g, n).
         forced: Rows on a plan, shape (N, g, N m).
@@ -268,10 +258,7 @@ class PlanGrid:
         return self._half - reach * (1.0 + rounding) - rounding * self._pushed
 
     def keeps(self, estimates: np.ndarray, row_limits: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
-        """Returns whether the box is kept by a margin between the samples of the first i+1 steps, shape (N, E, P).
-
-        For shapes see `PlanTest`; `row_limits` are what the method of that name returns for the error shape of each.
-        """
+        """Returns whether the box is kept by a margin between the samples of the first i+1 steps, shape (N, E, P)."""
         steps, g, n = self.free.shape
         count, number = plans.shape[:2]
         rounding = np.abs(estimates) @ (self._rounding[:, None, None] * self._size).reshape(-1, n).T
@@ -391,13 +378,9 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
 
 
 def _supports(rows: np.ndarray, sizes: np.ndarray, shapes: np.ndarray, rounding: np.ndarray) -> np.ndarray:
-    """Returns upper bounds of sqrt(b'Sb) for rows b, shape (E, N, k).
+    """Returns upper bounds of sqrt(b'Sb) for rows b, (N, k, n), and shapes S, (E, n, n): shape (E, N, k).
 
-    Args:
-        rows: b, shape (N, k, n).
-        sizes: |b| before any cancellation, shape (N, k, n).
-        shapes: S, shape (E, n, n).
-        rounding: Relative to products of absolute values, shape (N, 1).
+    Sizes are |b| before any cancellation, the rounding, (N, 1), is relative to products of absolute values.
     """
     extents = np.sqrt(np.abs(np.diagonal(shapes, axis1=1, axis2=2)))
     size = (sizes @ extents[:, None, :, None])[..., 0]

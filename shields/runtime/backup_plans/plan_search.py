@@ -46,10 +46,6 @@ class Plans(NamedTuple):
     lengths: np.ndarray
     distances: np.ndarray
 
-    def some(self, chosen: np.ndarray) -> Plans:
-        """Returns those of some environments, given by their indices."""
-        return Plans(*(part[chosen] for part in self))
-
 
 class Planner:
     """Finds certified plans (docs/lookahead.md).
@@ -65,7 +61,6 @@ class Planner:
 
     Attributes:
         test: The plan test.
-        horizon: N.
     """
 
     def __init__(self, first: SetTest, fallback: Fallback, horizon: int, margin: float) -> None:
@@ -116,8 +111,7 @@ class Planner:
         """Returns certified plans whose first inputs are the proposed ones.
 
         After the proposal comes a regulator or K in a prediction that knows no limits, what is stored for later and
-        then K, or the saturated regulator. The first candidate that is certified counts, and is all that is looked at;
-        the solver is not asked.
+        then K, or the saturated regulator. The first candidate that is certified counts; the solver is not asked.
         """
         tightening, continued = self.test.tightenings_of(shapes), self._continued(estimates, proposed)
         plans = self._best(estimates, tightening, continued[:, :1], proposed)
@@ -135,7 +129,6 @@ class Planner:
         return plans
 
     def _limited(self, estimates: np.ndarray, proposed: np.ndarray, stored: np.ndarray) -> np.ndarray:
-        """Returns proposals followed by what is stored for later and then K, or by the saturated regulator."""
         beginnings = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
         beginnings[:, :, 0] = proposed[:, None]
         beginnings[:, 0, 1:] = stored[:, 1:]
@@ -199,7 +192,6 @@ class Planner:
         return plans
 
     def _completed(self, estimates: np.ndarray, beginnings: np.ndarray) -> np.ndarray:
-        """Returns the beginnings of `find`, completed by the regulator, K, the regulator and K."""
         return completed(self._plant, self._fallback, estimates, beginnings, self._gains[[0, 1, 0, 1]])
 
     def improve(self, plans: Plans, chosen: np.ndarray, others: Plans) -> None:
@@ -217,7 +209,7 @@ class Planner:
     ) -> Plans:
         """Returns one certified plan of P for each environment, shape (E, P, N, m).
 
-        Of each the shortest certified beginning counts. The plan that begins closest is returned, of equal ones the
+        Of each the shortest certified beginning counts; the one that begins closest is returned, of equal ones the
         first.
         """
         certified = self.test.certified(estimates, tightening, plans)
@@ -229,8 +221,7 @@ class Planner:
     def _solved(self, estimates: np.ndarray, tightening: Tightening, proposed: np.ndarray) -> Plans:
         """Returns the shortest certified parts of the program's plans, as inputs that can be applied.
 
-        The program is solved for the whole horizon: on the registered plants that admits as much, and comes as close,
-        as every shorter length besides.
+        The program is solved for the whole horizon, which admits as much as all shorter ones on the registered plants.
         """
         row_limits, radius = self.test.limits_at(estimates, tightening)
         tried = np.full((len(estimates), 2, self.horizon, self._plant.m), np.nan)
@@ -255,9 +246,6 @@ class PlanProgram:
     Variables are the inputs from the middle of their limits, in units of half the range. A solver is set up once, with
     the pattern of the problem; then vectors and the entries of the cone are updated, so that a solution depends on its
     own data alone. Whoever solves takes the solver away, or sets another one up if somebody has it: threads share none.
-
-    Args:
-        prediction: Of the plant.
     """
 
     _solver: Any = None  # while nobody uses it
@@ -328,9 +316,6 @@ class PlanProgram:
             radius: Largest |T G c_j| of the last step.
             between: Largest distances of the rows of the grid from their middles in every step, shape (N, g).
             proposed: Shape (m,).
-
-        Raises:
-            ValueError: If an argument has another shape: that is no failure of the solver.
         """
         centers = self._free @ estimate + self._pushed
         moved = [(centers[:-1] @ self._C.T).ravel(), self._G @ centers[-1], self._between @ estimate]
@@ -383,7 +368,7 @@ def regulator(plant: LinearPlant, input_weight: float = INPUT_WEIGHT) -> np.ndar
 def closed_loop(plant: LinearPlant, gain: np.ndarray, steps: int) -> np.ndarray:
     """Returns the matrix, shape (n + m, steps m), that takes a row (x_hat, u_0) to u_0, u_1 = gain c_1, gain c_2, ...
 
-    All of them from a resting point. The centers are those of the inputs without limits.
+    All of them from a resting point, without limits of inputs.
     """
     center, inputs = np.hstack([plant.A, plant.B]), [np.eye(plant.n + plant.m)[plant.n :]]
     for _ in range(steps - 1):
@@ -397,12 +382,8 @@ def completed(
 ) -> np.ndarray:
     """Returns plans that go on with u_j = u_c + gain (c_j - x_c), saturated and expressible, where a beginning is NaN.
 
-    Args:
-        plant: Gives A, B and the limits.
-        fallback: Gives the resting point.
-        estimates: x_hat, shape (E, n).
-        beginnings: Inputs of P plans, shape (E, P, N, m), NaN where they are not given.
-        gains: Shape (P, m, n).
+    Of estimates x_hat, (E, n), beginnings of P plans, (E, P, N, m), and gains (P, m, n); the fallback has the resting
+    point.
     """
     number, steps = beginnings.shape[1:3]
     plans = np.ascontiguousarray(beginnings.transpose(2, 1, 0, 3))  # products with few large matrices are fast

@@ -31,10 +31,6 @@ class Lookahead:
         fallback: The certificate's.
         horizon: Longest plan, in steps.
         margin: By which plans must pass their test.
-
-    Attributes:
-        horizon: Longest plan, in steps.
-        planner: Finds the plans.
     """
 
     def __init__(self, test: SetTest, fallback: Fallback, horizon: int, margin: float) -> None:
@@ -53,10 +49,7 @@ class Lookahead:
         projected: np.ndarray,
         stored: Any,
     ) -> bool:
-        """Returns whether a plan might begin closer than a projected input does, both of a single environment.
-
-        If not, `keep` and `complete` leave the decision of mode "project" as it is.
-        """
+        """Returns whether a plan might begin closer than a projected input does; if not, that stays as it is."""
         if not np.isnan(self.as_stored(stored)[0, 0]):
             return True
         return self.planner.may_do_better(estimate, errors.shape, proposed, projected)
@@ -122,7 +115,6 @@ class Lookahead:
     def _rows(
         self, some: np.ndarray, estimates: np.ndarray, errors: PredictedErrors, inputs: np.ndarray, stored: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Returns what the planner takes of some environments."""
         x_hat, shapes = np.ascontiguousarray(estimates[:, some].T), errors.shape[..., some].transpose(2, 0, 1)
         return x_hat, shapes, inputs[:, some].T, stored[..., some].transpose(2, 0, 1)
 

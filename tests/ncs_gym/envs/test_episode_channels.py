@@ -17,7 +17,6 @@ from ncs_gym import (
     SpeedTracking,
     VectorNetworked,
     VectorRandomChannel,
-    cart_pole,
     truck_trailer,
 )
 from tests.ncs_gym.envs.same_draws import compare
@@ -28,7 +27,6 @@ PLANT = truck_trailer(mass=4000.0)
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.3)
 # Each draws as many numbers per step, so that scalar environments can be fed with those of a vector.
 LATE = [Channel(loss=0.3, delay=delay, quantization_step=0.02, send_period=1 + delay % 2) for delay in (0, 3, 5)]
-JITTERY = [Channel(loss=BURSTS, delay=1, jitter=2), Channel(loss=BURSTS, jitter=5, max_consecutive_losses=2)]
 
 
 def both(steps=40, **settings):
@@ -56,20 +54,11 @@ def test_downlink_of_an_episode_is_as_if_the_environment_were_made_with_it():
     np.testing.assert_array_equal(of_made(downlink=late), both(downlink=late, downlink_contract=contract)())
 
 
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("channels", [LATE, JITTERY])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_vector_with_a_channel_for_each_environment_equals_scalar_ones(channels, mode):
-    settings = {"terminate_on_violation": True, "autoreset_mode": mode, "max_episode_steps": 31}
-    env = vector_env(len(channels), plant=PLANT, channel=channels, task=SpeedTracking(), **settings)
-    compare(env, 90)
-    assert env.episodes.min() > 1
-    assert env.episode_channels == tuple(channels)
-
-
-def test_channels_of_a_reset_equal_scalar_ones_and_last_for_one_episode():
-    env = vector_env(3, plant=PLANT, channel=Channel(quantization_step=0.02), max_episode_steps=31)
-    compare(env, 90, {"channel": LATE})
+def test_channels_of_a_reset_equal_scalar_ones_and_last_for_one_episode(mode):
+    settings = {"autoreset_mode": mode, "max_episode_steps": 31, "task": SpeedTracking()}
+    env = vector_env(3, plant=PLANT, channel=Channel(quantization_step=0.02), **settings)
+    compare(env, 70, {"channel": LATE})
     assert set(env.episode_channels) == {env.channel}
     env.reset(seed=0, options={"channel": LATE})
     env.reset(seed=0, options={"reset_mask": np.array([True, False, False])})
@@ -148,9 +137,9 @@ def test_infos_say_which_channel_an_episode_has():
 
 def test_downlinks_for_each_environment_equal_scalar_ones():
     downlinks = [Channel(loss=0.5, delay=1, max_consecutive_losses=2), Channel(loss=0.2, max_consecutive_losses=1)]
-    env = vector_env(2, plant=PLANT, channel=Channel(delay=1), downlink=downlinks, max_episode_steps=31)
+    env = vector_env(2, plant=PLANT, channel=Channel(delay=1), downlink=downlinks[0], max_episode_steps=31)
     assert env.downlink_protocol.input_delay == 3
-    compare(env, 90)
+    compare(env, 90, {"downlink": downlinks})
 
 
 def test_other_environments_go_on_when_a_longer_delay_joins_in_the_middle_of_their_episodes():
@@ -198,17 +187,5 @@ def test_draws_follow_from_the_seed_and_pickled_wrappers_draw_the_same():
         env.reset(options={"channel": option})
         assert env.unwrapped.episode_channel == Channel(delay=9)
         env.reset()
+        assert env.unwrapped.episode_channel in LATE
     check_env(env, skip_render_check=True)
-
-
-def test_space_and_contract_are_those_of_the_widest_channel():
-    channels = [Channel(), Channel(loss=0.3, delay=2, max_consecutive_losses=1), Channel(delay=1)]
-    env = vector_env(3, plant=cart_pole(), channel=channels)
-    assert env.contract == ChannelContract(3)
-    widest = vector_env(3, plant=cart_pole(), channel=channels[1])
-    assert env.single_observation_space == widest.single_observation_space
-
-
-def test_make_vec_takes_channels_as_json_values():
-    env = gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, channel=[{"delay": 1}, {"loss": 0.5}])
-    assert env.unwrapped.episode_channels == (Channel(delay=1), Channel(loss=0.5))

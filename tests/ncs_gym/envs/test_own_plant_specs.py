@@ -146,10 +146,9 @@ def test_spec_of_a_registered_plant_is_json(settings, register):
 
 
 def test_spec_of_a_vector_environment_is_json(register):
-    channels = [Channel(loss=0.1), Channel(loss=BURSTS, delay=1)]
     register("Plants/Own-v0", own_plant())
     for made in (
-        gym.make_vec(LINEAR, num_envs=2, plant=own_plant(), channel=channels),
+        gym.make_vec(LINEAR, num_envs=2, plant=own_plant(), channel=Channel(loss=BURSTS, delay=1)),
         gym.make_vec("Plants/Own-v0", num_envs=2),
     ):
         again = gym.make_vec(EnvSpec.from_json(made.spec.to_json()))

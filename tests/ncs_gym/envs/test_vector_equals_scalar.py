@@ -1,10 +1,6 @@
 """The vector environment equals the scalar one, fed with the same draws; shared graphs and copies change nothing."""
 
-import copy
 import gc
-import pickle
-import sys
-import threading
 import tracemalloc
 import weakref
 
@@ -120,7 +116,7 @@ ENVIRONMENTS = (
 )
 
 
-@pytest.mark.cases(8)
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_equals_scalar_environments_with_the_same_draws(name):
     env = ENVIRONMENTS[name]()
@@ -137,7 +133,7 @@ def test_a_graph_that_forgets_changes_nothing(name, monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 40)
     env = make(name, 3, channel=Channel(loss=0.3, max_consecutive_losses=2, jitter=2), max_episode_steps=-1).unwrapped
     before = env._now.estimator.histories
-    compare(env, 200)
+    compare(env, 120)
     assert env._now.estimator.histories is not before
     assert len(env._now.estimator.histories) <= 60
 
@@ -169,54 +165,15 @@ def test_environments_that_share_a_graph_do_not_notice_each_other(kind, most, mo
     monkeypatch.setattr(arrival_histories, "_shared", {})
     alone = KINDS[kind]()
     alone.reset(seed=1)
-    wanted = list(steps_of(alone, 120))
+    wanted = list(steps_of(alone, 70))
     monkeypatch.setattr(arrival_histories, "_shared", {})
     envs = [KINDS[kind](), KINDS["scalar"](), KINDS["vector"]()]
     graphs = {id(env._now.estimator.histories) for env in envs[:2] if kind == "scalar"}
     assert len(graphs) <= 1
     for seed, env in enumerate(envs, 1):
         env.reset(seed=seed)
-    runs = zip(*(steps_of(env, 120, seed) for seed, env in enumerate(envs)), strict=True)
+    runs = zip(*(steps_of(env, 70, seed) for seed, env in enumerate(envs)), strict=True)
     assert_equal([run[0] for run in runs], wanted)
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_copy_made_in_the_middle_of_an_episode_goes_on_like_the_original(kind, copied):
-    env = KINDS[kind]()
-    env.reset(seed=0)
-    list(steps_of(env, 29))
-    twin = copied(env)
-    wanted = list(steps_of(env, 60, seed=1))
-    assert_equal(steps_of(twin, 60, seed=1), wanted)
-
-
-@pytest.mark.parametrize("most", [pytest.param(1 << 17, marks=pytest.mark.slow), 300])
-def test_threads_share_a_graph(most, monkeypatch):
-    settings = {"plant": truck_trailer(), "channel": Channel(loss=0.3, jitter=3, delay=1)}
-
-    def run(seed, returned):
-        env = vector_env(8, **settings)
-        env.reset(seed=seed)
-        returned[seed] = list(steps_of(env, 100))
-
-    alone, together = {}, {}
-    for seed in range(4):
-        run(seed, alone)
-    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", most)
-    interval = sys.getswitchinterval()
-    try:
-        sys.setswitchinterval(1e-6)
-        monkeypatch.setattr(arrival_histories, "_shared", {})
-        threads = [threading.Thread(target=run, args=(seed, together)) for seed in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    finally:
-        sys.setswitchinterval(interval)
-    for seed in range(4):
-        assert_equal(together[seed], alone[seed])
 
 
 @pytest.mark.parametrize(
@@ -252,7 +209,7 @@ def test_graphs_that_nobody_uses_any_more_are_freed(monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 100)
     env, graphs = vector_env(3, **OVERTAKING), weakref.WeakSet()
     env.reset(seed=0)
-    for _ in steps_of(env, 500):
+    for _ in steps_of(env, 250):
         graphs.add(env._now.estimator.histories)
     gc.collect()
     assert len(graphs) <= 3
@@ -277,7 +234,7 @@ def test_a_graph_has_room_for_many_environments(monkeypatch):
     env = vector_env(100, plant=truck_trailer(), channel=Channel(loss=0.3, jitter=3))
     env.reset(seed=0)
     graphs = []
-    for _ in range(100):
+    for _ in range(50):
         env.step(np.zeros((100, 1), np.float32))
         graphs.append(env._now.estimator.histories)
     assert 2 < len(set(map(id, graphs))) < 60

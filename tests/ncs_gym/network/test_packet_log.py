@@ -130,8 +130,6 @@ def test_a_record_cut_for_one_duration_of_steps_is_for_that_alone(tmp_path):
     words = r"steps of 0.1 s, and steps take 0.5 s here: make another one with PacketLog.channel\(0.5\)"
     with pytest.raises(ValueError, match=words):
         gym.make(cruise, channel=log.channel(0.1))
-    with pytest.raises(ValueError, match=words):
-        gym.make_vec(cruise, num_envs=2, channel=[log.channel(0.1), Channel()])
     env = gym.make(cruise, downlink=Channel(delay=2, max_consecutive_losses=1))
     for name in ("channel", "downlink"):
         with pytest.raises(ValueError, match=words):

@@ -3,7 +3,6 @@
 import json
 import pickle
 import warnings
-from itertools import count
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +11,7 @@ import torch
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
-from gymnasium.wrappers import DelayObservation, TimeLimit, TransformReward
+from gymnasium.wrappers import DelayObservation, TimeLimit
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
@@ -21,15 +20,15 @@ from ncs_gym import (
     GilbertElliott,
     Networked,
     RandomChannel,
-    RequestActions,
     TraceChannel,
     VectorNetworked,
-    VectorRandomChannel,
 )
 from tests.ncs_gym.networked.environments import Counter, Sampled, ages_of_trace
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
 LATE = Channel(loss=0.3, delay=1, jitter=2)
+REQUESTED = Channel(on_request=True)
+ASKING = {"channel": REQUESTED}
 NEUTRAL = {"Pendulum-v1": np.zeros(1, np.float32), "CartPole-v1": 0}
 EVERYTHING = {
     "channel": Channel(loss=BURSTS, delay=1, jitter=2, send_period=2),
@@ -94,36 +93,16 @@ def test_delay_is_that_of_gymnasium():
 
 
 @pytest.mark.parametrize(
-    ("late", "idle", "acted"),
-    [
-        # Commands 1, 2, ... that arrive after 0, 2, 0, lost, 1, 0, 3, 0 steps, around again.
-        ("apply", "hold", [1, 1, 3, 3, 3, 6, 6, 8, 9, 9]),
-        ("apply", "neutral", [1, 0, 3, 0, 0, 6, 0, 8, 9, 0]),
-        ("drop", "hold", [1, 1, 3, 3, 3, 6, 6, 8, 9, 9]),
-        ("queue", "hold", [1, 1, 3, 2, 2, 5, 6, 8, 9, 7]),
-    ],
+    ("idle", "acted"), [("hold", [1, 1, 3, 3, 3, 6, 6, 8, 9, 9]), ("neutral", [1, 0, 3, 0, 0, 6, 0, 8, 9, 0])]
 )
-def test_commands_that_are_late_act_as_asked_for(late, idle, acted):
-    trace = (0, 2, 0, -1, 1, 0, 3, 0)
-    seed = next(each for each in count() if _begins_at_its_first(trace, each))
-    returned = run(Networked(Counter(), downlink=TraceChannel(trace=trace), late=late, idle=idle), 10, seed)
-    infos = [each[-1] for each in returned[1:]]
-    assert [info["acted"] for info in infos] == acted
+def test_commands_that_are_late_act_as_asked_for(idle, acted):
+    """Commands 1, 2, ... arrive after 0, 2, 0, lost, 1, 0, 3, 0 steps, around again from the first of a seed."""
+    env = Networked(Counter(), downlink=TraceChannel(trace=(0, 2, 0, -1, 1, 0, 3, 0)), idle=idle)
+    runs = ([each[-1] for each in run(env, 10, seed)[1:]] for seed in range(200))
+    infos = next(infos for infos in runs if [info["acted"] for info in infos] == acted)
     assert [info["action_applied"][0] for info in infos] == acted
     ages = [step + 1 - act if act else -1 for step, act in enumerate(acted)]
     assert [info["action_age"] for info in infos] == ages
-
-
-def _begins_at_its_first(trace, seed):
-    """Whether the record of a downlink begins at its first packet for a seed: nothing is held or late then."""
-    env = Networked(Counter(), downlink=TraceChannel(trace=trace), late="drop", idle="neutral")
-    return [each[-1]["acted"] for each in run(env, 8, seed)[1:]] == [1, 0, 3, 0, 0, 6, 0, 8]
-
-
-def test_fixed_delay_of_commands_is_not_late():
-    infos = [each[-1] for each in run(Networked(Counter(), downlink=Channel(delay=2), late="drop"), 6)[1:]]
-    assert [info["acted"] for info in infos] == [0, 0, 1, 2, 3, 4]
-    assert [info["action_age"] for info in infos] == [-1, -1, 2, 2, 2, 2]
 
 
 def test_each_key_has_a_channel_of_its_own():
@@ -164,16 +143,6 @@ def test_exact_prediction_makes_up_for_delays(channel):
     assert (envs.reset(seed=0)[0] == 0).all()
     for k in range(1, 41):
         assert (envs.step(np.full((5, 1), k + 0.0))[0] == k).all()
-
-
-def test_rest_of_delayed_rewards_that_nobody_pays_is_told_of():
-    inside = Networked(TimeLimit(Counter(length=99), 9), Channel(delay=4), delay_reward=True)
-    outside = TimeLimit(Networked(Counter(length=99), Channel(delay=4), delay_reward=True), 9)
-    paid = [sum(float(each[1]) for each in run(env, 9)[1:]) for env in (inside, outside)]
-    assert paid[0] > paid[1]
-    inside.reset()
-    with pytest.warns(UserWarning, match=f"rewards of {paid[0] - paid[1]:g} were on their way"):
-        outside.reset()
 
 
 def test_entries_are_what_infos_say_and_actions_are_those_decided():
@@ -277,7 +246,7 @@ def test_observations_without_arrays_are_late_one_by_one(space):
         seen = env.step(0)[0]
         assert env.observation_space.contains(seen)
         assert gym.utils.env_checker.data_equivalence(seen, env.unwrapped.given[max(k - 2, 0)])
-    with pytest.raises(ValueError, match=r"takes observations that are arrays, not .*: put Networked around each"):
+    with pytest.raises(ValueError, match=r"takes observations that are one array, not .*: put Networked around each"):
         VectorNetworked(gym.vector.SyncVectorEnv([lambda: Sampled(space)] * 2), Channel(delay=2))
 
 
@@ -297,32 +266,6 @@ def test_network_does_not_depend_on_what_the_environment_draws():
     ]
     assert ages[0] == ages[1]
     assert ages[0] != [each[-1]["measurement_age"] for each in run(Networked(Counter(), LATE), 50, seed=5)]
-
-
-def test_rewards_travel_with_samples_if_asked_to_and_nothing_is_lost():
-    now, later = (run(Networked(Counter(length=30), LATE, delay_reward=late), 30) for late in (False, True))
-    assert [each[1] for each in now[1:]] == list(range(1, 31))
-    assert sum(each[1] for each in later[1:]) == sum(range(1, 31))
-    for k, each in enumerate(later[1:-1], 1):
-        newest = k - each[-1]["measurement_age"]
-        assert sum(other[1] for other in later[1 : k + 1]) == sum(range(1, newest + 1))
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize("is_vector", [False, True])
-def test_rewards_travel_with_the_newest_of_several_samples(sign, is_vector):
-    channels = {"count": Channel(), "odd": Channel(delay=5)}
-
-    def make():
-        return TransformReward(Counter("dict", length=12), lambda reward: sign * reward)
-
-    if is_vector:
-        env, action = VectorNetworked(SyncVectorEnv([make, make]), channels, delay_reward=True), np.zeros((2, 1))
-    else:
-        env, action = Networked(make(), channels, delay_reward=True), np.zeros(1)
-    env.reset(seed=0)
-    rewards = [np.ravel(env.step(action)[1])[-1] for _ in range(12)]
-    assert rewards == [sign * k for k in range(1, 13)]
 
 
 @pytest.mark.parametrize("kind", ["dict", "tuple", "list", "tensor"])
@@ -364,20 +307,12 @@ class Echo(gym.Env):
         return np.array(action, np.float32), 0.0, False, False, {}
 
 
-@pytest.mark.cases(2)
-@pytest.mark.parametrize("late", ["apply", "queue"])
-@pytest.mark.parametrize(
-    "downlink",
-    [
-        {"jitter": 1}, {"jitter": 3}, {"delay": 1, "jitter": 2}, {"delay": 3},
-        {"jitter": 3, "loss": 0.3, "max_consecutive_losses": 2},
-    ],
-)  # fmt: skip
-def test_actions_that_act_are_among_those_pending(late, downlink):
-    env = Networked(Echo(), downlink=Channel(**downlink), late=late, neutral=[-1.0], observe="pending_actions")
+@pytest.mark.parametrize("downlink", [{"delay": 3}, {"jitter": 3, "loss": 0.3, "max_consecutive_losses": 2}])
+def test_actions_that_act_are_among_those_pending(downlink):
+    env = Networked(Echo(), downlink=Channel(**downlink), neutral=[-1.0], observe="pending_actions")
     observation, _ = env.reset(seed=0)
     oldest = 0
-    for k in range(1000):
+    for k in range(500):
         pending = observation[1:]
         observation, *_, info = env.step(np.array([k], np.float32))
         action = float(info["action_applied"][0])
@@ -398,7 +333,7 @@ def test_checkers_pass(env_id, settings):
 
 
 def test_spec_survives_json_and_pickling():
-    env = Networked(gym.make("CartPole-v1"), **EVERYTHING, neutral=1, late="queue")
+    env = Networked(gym.make("CartPole-v1"), **EVERYTHING, neutral=1)
     text = env.spec.to_json()
     again = gym.make(gym.envs.registration.EnvSpec.from_json(text))
     assert json.loads(again.spec.to_json()) == json.loads(text)
@@ -416,8 +351,8 @@ def test_channels_of_episodes_are_drawn_or_given_and_other_options_reach_the_env
     assert delays == set(range(5))
     info = env.reset(options={"channel": Channel(delay=9), "start": 3})[1]
     assert (inner.episode_channel.delay, info["options"]) == (9, {"start": 3})
-    inner.reset()
-    assert inner.episode_channel.delay == 1
+    delays = {inner.reset()[1]["channel_delay"] for _ in range(40)}  # by whatever name it is called
+    assert delays == set(range(5))
 
 
 TWO_SENSORS = gym.spaces.Dict({name: gym.spaces.Box(-1.0, 1.0, (1,)) for name in "ab"})
@@ -425,77 +360,24 @@ DELAYED = [Channel(delay=1), Channel(delay=3)]
 NETWORK = {"a": Channel(), "b": Channel(delay=5)}
 
 
-@pytest.mark.parametrize("many", [False, True])
-def test_channels_of_several_sensors_are_drawn_by_their_keys(many):
-    if many:
-        inner = VectorNetworked(SyncVectorEnv([lambda: Sampled(TWO_SENSORS)] * 8), NETWORK)
-        drawn = VectorRandomChannel
-    else:
-        inner, drawn = Networked(Sampled(TWO_SENSORS), NETWORK), RandomChannel
+def test_channels_of_several_sensors_are_drawn_by_their_keys():
+    inner = Networked(Sampled(TWO_SENSORS), NETWORK)
 
     def delays(env, **options):
         """The different pairs of delays in many episodes."""
         infos = [env.reset(seed=seed, options=options)[1]["channel_delay"] for seed in range(40)]
-        return {pair for info in infos for pair in zip(*(np.ravel(info[key]).tolist() for key in "ab"), strict=True)}
+        return {(info["a"], info["b"]) for info in infos}
 
-    assert delays(drawn(inner, {"a": DELAYED})) == {(1, 5), (3, 5)}
-    assert delays(drawn(inner, {"a": DELAYED, "b": lambda rng: Channel(delay=2)})) == {(1, 2), (3, 2)}
-    assert delays(drawn(inner, DELAYED)) == {(1, 1), (1, 3), (3, 1), (3, 3)}
-    assert delays(drawn(inner, DELAYED), channel={"b": Channel(delay=7)}) == {(1, 7), (3, 7)}
-    assert delays(drawn(inner, {"a": DELAYED}), channel=Channel(delay=4)) == {(4, 4)}
+    assert delays(RandomChannel(inner, {"a": DELAYED})) == {(1, 5), (3, 5)}
+    assert delays(RandomChannel(inner, {"a": DELAYED, "b": lambda rng: Channel(delay=2)})) == {(1, 2), (3, 2)}
+    assert delays(RandomChannel(inner, DELAYED)) == {(1, 1), (1, 3), (3, 1), (3, 3)}
+    assert delays(RandomChannel(inner, DELAYED), channel={"b": Channel(delay=7)}) == {(1, 7), (3, 7)}
+    assert delays(RandomChannel(inner, {"a": DELAYED}), channel=Channel(delay=4)) == {(4, 4)}
     for wrong in ({"c": DELAYED}, [NETWORK], {"a": Channel()}, {}):
         with pytest.raises(ValueError, match="channel"):
-            drawn(inner, wrong)
+            RandomChannel(inner, wrong)
     with pytest.raises(ValueError, match="channel must be a function"):
         RandomChannel(Networked(gym.make("CartPole-v1")), {"a": DELAYED})
-
-
-@pytest.mark.parametrize("make", [Counter, lambda: gym.wrappers.DtypeObservation(gym.make("CartPole-v1"), np.float64)])
-def test_requests_keep_the_type_of_observations_and_actions(make):
-    env = RequestActions(Networked(make(), Channel(on_request=True)))
-    env.action_space.seed(0)
-    seen = [env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(5))]
-    assert {each.dtype for each in seen} == {env.observation_space.dtype, np.dtype(np.float64)}
-    assert all(map(env.observation_space.contains, seen))
-    with pytest.raises(ValueError, match="an entry more of a vector of numbers, got Discrete"):
-        RequestActions(Networked(gym.make("FrozenLake-v1"), Channel(on_request=True)))
-
-
-@pytest.mark.parametrize("delay", [0, 1, 2])
-def test_a_sample_that_cannot_arrive_any_more_is_not_outstanding(delay):
-    env = RequestActions(Networked(Counter(), Channel(on_request=True, loss=1.0, delay=delay)))
-    env.reset(seed=0)
-    seen = [env.step(np.array([0.0, 1.0 if k == 0 else -1.0]))[0][-1] for k in range(5)]
-    assert seen == [1.0] * delay + [0.0] * (5 - delay)
-
-
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
-def test_samples_on_request_cost_and_come_only_then(env_id):
-    env = RequestActions(Networked(gym.make(env_id), Channel(on_request=True)), cost=0.5)
-    bare = gym.make(env_id)
-    env.reset(seed=0), bare.reset(seed=0)
-    for k in range(8):
-        ask = k % 3 == 0
-        action = [0, int(ask)] if env_id == "CartPole-v1" else np.array([0.5, 1.0 if ask else -1.0], np.float32)
-        seen, reward, *_, info = env.step(np.array(action))
-        wanted, plain, *_ = bare.step(0 if env_id == "CartPole-v1" else np.array([0.5], np.float32))
-        assert reward == pytest.approx(plain - 0.5 * ask)
-        assert info["measurement_age"] == k % 3
-        assert np.array_equal(seen[:-2], wanted) == ask
-        assert seen[-2] == k % 3
-
-
-def test_agent_that_sees_nothing_because_nobody_asks_is_told_once_in_an_episode():
-    env = Networked(Counter(), Channel(on_request=True))
-    for _ in range(2):
-        env.reset()
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            for _ in range(30):
-                env.step(env.action_space.sample())
-        assert [each.category for each in caught] == [UserWarning]
-        assert "RequestActions" in str(caught[0].message)
-        assert caught[0].filename == __file__
 
 
 @pytest.mark.parametrize(
@@ -515,12 +397,10 @@ def test_agent_that_sees_nothing_because_nobody_asks_is_told_once_in_an_episode(
             "each at most once, of age, arrived, pending_actions, got 'ages'",
         ),
         ({"fill": "nothing"}, "fill must be 'last', 'zero' or a function"),
-        ({"late": "never"}, "late must be one of 'apply', 'drop', 'queue', got 'never'"),
+        ({"idle": "never"}, "idle must be one of 'hold', 'neutral', got 'never'"),
         ({"pending": 0}, "pending must be"),
         ({"pending": 4, "observe": "age"}, "pending is how many actions a predictor gets"),
-        ({"late": "drop"}, "late is about a network of the actions: give downlink"),
         ({"idle": "neutral"}, "idle is about a network of the actions: give downlink"),
-        ({"delay_reward": 1}, "delay_reward must be"),
     ],
 )
 def test_wrong_settings_are_one_sentence(settings, sentence):
@@ -537,12 +417,11 @@ def test_networks_that_do_not_fit_are_one_sentence():
         Networked(gym.make("FrozenLake-v1"), Channel(quantization_step=0.1))
     with pytest.raises(ValueError, match="has no zero"):
         Networked(gym.wrappers.TransformObservation(Counter(), None, gym.spaces.Box(1.0, 2.0, (1,))), fill="zero")
-    with pytest.raises(ValueError, match="made for channels with on_request=False"):
-        Networked(Counter()).reset(options={"channel": Channel(on_request=True)})
+    for wrong in (lambda: Networked(Counter(), REQUESTED), lambda: Networked(Counter()).reset(options=ASKING)):
+        with pytest.raises(ValueError, match="samples on request are for an NCSEnv"):
+            wrong()
     with pytest.raises(ValueError, match="has an ideal downlink"):
         Networked(Counter()).reset(options={"downlink": Channel()})
-    with pytest.raises(ValueError, match="sends samples by itself"):
-        Networked(Counter()).request()
     with pytest.raises(ValueError, match="a function for fill is for one channel"):
         Networked(Counter("dict"), {"count": Channel()}, fill=lambda *given: None)
     with pytest.raises(ValueError, match="Autoreset inside begins episodes"):

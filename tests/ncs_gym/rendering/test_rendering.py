@@ -6,7 +6,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import gymnasium as gym
 import numpy as np
@@ -14,19 +14,16 @@ import pygame
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordVideo
-from gymnasium.wrappers.vector import RecordVideo as RecordVectorVideo
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
-from agents import SB3VecEnv
 from ncs_gym import Channel, Ellipsoid
 from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import Annotation, theme
 from ncs_gym.rendering.episode_record import PacketRecord
 from ncs_gym.rendering.phase_plane import PhasePlane
-from tests.certificates import certificate_of
 from tests.plants import random_plant
-from tests.product import safety_shield, vector_shield
+from tests.product import safety_shield
 
 CRUISE, REACTOR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/BatchReactor-v0"
 DRAWN = [env_id for env_id in ENVIRONMENTS if env_id not in needing_extras()]
@@ -224,40 +221,19 @@ def test_drawing_does_not_change_the_episode_nor_writing_into_an_info_the_pictur
 
 
 def test_recorders_of_gymnasium_and_stable_baselines3_write_files(tmp_path):
-    vector, settings = partial(gym.make_vec, CRUISE, num_envs=3, render_mode="rgb_array"), {"video_length": 3}
-    for name, env in (
-        ("one", RecordVideo(make(), str(tmp_path / "one"), **settings)),
-        ("many", RecordVectorVideo(vector(), str(tmp_path / "many"), record_first_only=True, **settings)),
-    ):
-        env.reset(seed=0)
-        steps_of(env, 4)
-        env.close()
-        assert next((tmp_path / name).glob("*.mp4")).stat().st_size > 1000
-    recorder = VecVideoRecorder(SB3VecEnv(vector()), str(tmp_path / "sb3"), lambda step: step == 0, **settings)
+    settings = {"video_length": 3}
+    env = RecordVideo(make(), str(tmp_path / "one"), **settings)
+    env.reset(seed=0)
+    steps_of(env, 4)
+    env.close()
+    assert next((tmp_path / "one").glob("*.mp4")).stat().st_size > 1000
+    many = make_vec_env(CRUISE, n_envs=2, seed=0)
+    recorder = VecVideoRecorder(many, str(tmp_path / "sb3"), lambda step: step == 0, **settings)
     recorder.reset()
     for _ in range(4):
-        recorder.step(np.zeros((3, 1), np.float32))
+        recorder.step(np.zeros((2, 1), np.float32))
     recorder.close()
     assert list((tmp_path / "sb3").glob("*.mp4"))
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_chosen_environment_of_a_vector_is_drawn_as_a_single_one_would_be(mode):
-    settings = {"rendered_env": 2, "max_episode_steps": 11, "autoreset_mode": mode}
-    env = gym.make_vec(CRUISE, num_envs=3, render_mode="rgb_array", **settings)
-    shield = vector_shield(env, certificate_of(env.unwrapped.plant))
-    single = safety_shield(make(), shield.certificate)
-    _, info = shield.reset(seed=0)
-    single.reset(options={"state": info["state"][2]})
-    assert shield.render()[0].shape == single.render().shape
-    for _ in range(30):
-        info = shield.step(np.ones((3, 1)))[-1]
-        record = env.unwrapped.single.renderer.episode
-        np.testing.assert_array_equal(record.state, info["state"][2])
-        assert record.step == env.unwrapped.steps[2]
-        assert record.annotation.interventions == info["episode_interventions"][2]
-        assert [packet.stamp for packet in record.packets] == list(range(2, record.step + 1, 2))
-    assert len(shield.render()) == 3
 
 
 def test_human_mode_shows_every_step_and_closes(monkeypatch):

@@ -80,7 +80,7 @@ def campaign() -> list:
     return rows
 
 
-@pytest.mark.cases(24)
+@pytest.mark.cases(18)
 @pytest.mark.parametrize(("name", "mode", "through", "is_whole"), campaign())
 def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
     first = [*CASES].index(name) + MODES.index(mode)

@@ -190,22 +190,6 @@ def test_inputs_beyond_their_limits_are_not_certified(case):
     assert certified[:2].any()
 
 
-def test_an_estimate_alone_is_judged_as_in_a_batch(case):
-    plant, certificate, test = case
-    rng = np.random.default_rng(6)
-    estimates, shapes, _ = situations(plant, certificate, rng, 200)
-    plans = rng.uniform(-1, 1, (200, 3, STEPS, plant.m)) * plant.u_max * rng.uniform(0.1, 1.0, (200, 3, 1, 1))
-    plans[::20, 1, 2, 0] *= 20.0  # beyond the limits
-    for values, broken in ((estimates, np.nan), (shapes, np.nan), (plans, np.inf), (estimates, 1e120)):
-        values[rng.integers(200, size=3)] = broken
-    many = test.certified(estimates, test.tightenings_of(shapes), plans)
-    for x_hat, shape, several, expected in zip(estimates, shapes, plans, many, strict=True):
-        alone = test.certified(x_hat[None], test.tightenings_of(shape[None]), several[None])[0]
-        np.testing.assert_array_equal(alone, expected)
-    assert many.any(axis=(0, 1)).all()
-    assert not many.all(axis=(0, 1)).any()
-
-
 def test_indefinite_shapes_leave_no_room(case):
     _, certificate, test = case
     tightening = test.tightenings_of(-certificate.Sigma[None])

@@ -12,10 +12,8 @@ from ncs_gym import Ellipsoid
 from ncs_gym.uncertainty.shape_matrices import outer_sum
 from shields import SafetyFilter
 from shields.runtime.backup_plans import plan_search
-from shields.runtime.backup_plans.plan_search import closed_loop
 from tests.product import safety_filter
 from tests.shields.attacks.cases import case
-from tests.shields.attacks.worlds import BOX, through_loop
 from tests.shields.runtime.batches import decided_alike
 
 NAMES = ["cruise", "cart-pole", "batch reactor", "n=4 m=3 p=2"]
@@ -275,20 +273,6 @@ def test_a_single_proposal_that_a_gain_continues_is_kept_without_a_batch(name, m
     assert decided > 0.6 * len(kept) > 0
 
 
-@pytest.mark.cases(2)
-@pytest.mark.parametrize("name", NAMES)
-def test_a_loop_in_one_product_is_the_loop_step_by_step(name):
-    shield, rng = shield_of(name), np.random.default_rng(8)
-    plant, gain = shield.plant, shield.certificate.K
-    x_hat, u = rng.uniform(-1, 1, plant.n) * plant.half_widths, rng.uniform(-1, 1, plant.m) * plant.u_max
-    expected, center = [u], plant.A @ x_hat + plant.B @ u
-    for _ in range(shield.horizon - 1):
-        expected.append(gain @ center)
-        center = plant.A @ center + plant.B @ expected[-1]
-    found = np.concatenate([x_hat, u]) @ closed_loop(plant, gain, shield.horizon)
-    np.testing.assert_allclose(found, np.concatenate(expected), rtol=1e-9, atol=1e-9 * plant.u_max.max())
-
-
 def broken_solver(how, rng):
     """A solver that does something wrong when it is made, updated or asked to solve."""
 
@@ -357,14 +341,3 @@ def test_a_solver_that_fails_means_a_certified_plan_or_the_stored_one(how, monke
         assert decision.stored or certified[len(decision.plan)]
     assert "stored" in reasons
     assert sum(one.reason == "planned" for one in working) > sum(one.reason == "planned" for one in failing)
-
-
-@pytest.mark.cases(1)
-@pytest.mark.filterwarnings("ignore::ncs_gym.network.packet_reception.UnusedPacketsWarning")
-@pytest.mark.parametrize("how", FAILURES)
-def test_no_failure_of_the_solver_leaves_the_box(how, monkeypatch):
-    break_solver(monkeypatch, how, np.random.default_rng(0))
-    outcome = through_loop(case("cart-pole"), "lookahead", 2, 70, 0)
-    assert 0.9 < outcome.largest[BOX] <= 1.0
-    assert outcome.counts["stored"] > 0
-    assert not outcome.lost

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ncs_gym import Actuator, Channel, Ellipsoid, FunctionProcess, cart_pole, truck_trailer
+from ncs_gym import Actuator, Channel, Ellipsoid, cart_pole, truck_trailer
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from shields.runtime.guarantee import (
@@ -333,16 +333,3 @@ def test_actuator_takes_the_newest_command_of_its_episode_and_repeats_nothing():
     actuator.receive(commands)
     np.testing.assert_array_equal(actuator.apply(4), 0.0)
     assert actuator.missing
-
-
-def test_another_process_than_the_plants_equations_may_move_behind_a_downlink():
-    process = FunctionProcess(lambda x, u: PLANT.A @ x + PLANT.B @ u)
-    shield = shielded(process=process, disturbance="adversarial")
-    _, info = shield.reset(seed=0)
-    assert info["shield_guaranteed"]
-    rng, worst = np.random.default_rng(0), 0.0
-    for _ in range(200):
-        *_, info = shield.step(rng.uniform(-1, 1, 1))
-        assert info["shield_guaranteed"], info["shield_reason"]
-        worst = max(worst, levels(shield, info))
-    assert 0.5 < worst <= 1.0

@@ -47,7 +47,7 @@ PLACES = {
 }
 
 
-@pytest.mark.cases(12)
+@pytest.mark.cases(9)
 @pytest.mark.parametrize("raised", RAISED)
 @pytest.mark.parametrize("when", ["before", "after"])
 @pytest.mark.parametrize(("call", "place"), [(call, place) for call in PLACES for place in PLACES[call]])

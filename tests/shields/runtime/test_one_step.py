@@ -212,18 +212,6 @@ def test_what_cannot_be_used_spoils_no_other_shape_of_the_batch():
         np.testing.assert_array_equal(array[..., 0], array[..., -1])
 
 
-def test_one_state_leaves_nothing_to_be_sharper_about():
-    plant = random_plant(3, 1, 1)
-    certificate = certificate_of(plant)
-    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(0)
-    for estimate, shape, u in cases(certificate, plant, rng, 50):
-        *_, h = predicted(certificate, plant, shape)
-        test_margin, margin = margins(reachable(test, estimate, shape), u)
-        center = abs(plant.A @ estimate + plant.B @ u).item() / np.sqrt(certificate.L.item())
-        assert test_margin == pytest.approx(margin, abs=1e-12)
-        assert test_margin == pytest.approx(1.0 - h - center, abs=1e-9)
-
-
 def test_bounds_on_rounding_hold_column_by_column():
     # A plant whose states differ much in size, and a disturbance that is far from the unit ball of the safe set.
     A = np.array([[0.5, 40.0, 0.0], [0.0, 0.4, -300.0], [0.0, 0.0, 0.3]])

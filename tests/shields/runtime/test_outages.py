@@ -5,10 +5,9 @@ import pickle
 import numpy as np
 import pytest
 
-from ncs_gym import Actuator, Channel, ChannelContract, Packet, cart_pole, truck_trailer
+from ncs_gym import Actuator, Channel, ChannelContract, Packet, cart_pole
 from ncs_gym.network.actuator import Command
 from shields.runtime.guarantee import (
-    ALARM,
     LATE_INPUT,
     NOT_CONFIRMED,
     OTHER_EPISODE,
@@ -141,27 +140,6 @@ def test_command_that_comes_early_is_kept_for_its_step():
     actuator.receive([Command(0, np.array([[0.0], [1.0]])), Command(1, np.array([[1.0], [2.0]]))])
     assert [actuator.apply(step).tolist() for step in range(4)] == [[0.0], [1.0], [2.0], [0.0]]
     assert (actuator.missing, actuator.echo.missing) == (True, 1)
-
-
-# With a known first estimate a sample of step 0 is of no use.
-@pytest.mark.parametrize("first", [1, 2])
-@pytest.mark.parametrize("apart", [0, 1, 3])
-def test_two_values_of_one_sample_end_the_guarantee(apart, first):
-    plant = truck_trailer(mass=4000.0)
-    loop = safe_loop(certificate_of(plant), plant, Channel(delay=4), on_unproved="ignore")
-    loop.start(np.zeros(2))
-    proved, arrivals = [], {}
-    arrivals.setdefault(first + 1, []).append(Packet(first, np.zeros(2), loop.episode))
-    arrivals.setdefault(first + 1 + apart, []).append(Packet(first, np.array([1.3, 0.0]), loop.episode))
-    for step in range(12):
-        usual = [Packet(step - 1, np.zeros(2), loop.episode)] if step > first + 1 + apart else []
-        loop.receive(arrivals.get(step, []) + usual)
-        proved.append(loop.guaranteed)
-        loop.decide(np.zeros(1))
-    assert not any(proved[first + 1 + apart :])
-    assert loop.reason == ALARM
-    loop.start(np.zeros(2))
-    assert loop.guaranteed
 
 
 def test_actuator_whose_clock_goes_back_says_that_it_applied_something_else():

@@ -152,19 +152,6 @@ def test_packet_of_an_earlier_episode_is_discarded_whatever_its_stamp(stepped):
     assert loop.reason == ALARM
 
 
-def test_packets_of_an_earlier_episode_are_of_no_use_if_steps_are_counted_on():
-    # The sensor counts its samples from the very first start; the loop subtracts where this episode began.
-    loop = started(channel=Channel(delay=3))
-    for _ in range(10):
-        loop.step(0.0)
-    began, far = loop.steps, np.array([9.0, 9.0])
-    loop.start([0.0, 0.0])
-    loop.step(0.0)
-    loop.step(0.0, [Packet(stamp - began, far, loop.episode) for stamp in (began - 2, began)])
-    assert loop.guaranteed
-    assert loop.measurement_age == 1
-
-
 def test_step_is_receive_and_then_decide():
     one, two = started(channel=Channel()), started(channel=Channel())
     for step in range(20):

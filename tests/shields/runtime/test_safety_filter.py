@@ -8,8 +8,7 @@ from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 from tests.product import altered, safety_filter
-from tests.shields.attacks.cases import RANDOM
-from tests.shields.edges import edge_of
+from tests.shields.edges import edge_of, gained
 from tests.shields.runtime.batches import decided_alike
 
 TWO_STATES = random_plant(3, 2, 1)
@@ -186,7 +185,7 @@ def test_proposed_fallback_is_no_intervention(case):
         shield, seen = safety_filter(certificate, plant, mode), 0
         for _ in range(200):
             estimate = 3.0 * certificate.safe_set.sample(rng)
-            decision = shield.decide(estimate, certificate.Sigma, shield.fallback_input(estimate))
+            decision = shield.decide(estimate, certificate.Sigma, gained(shield, estimate))
             assert not decision.intervened
             seen += decision.reason == "fallback"
         assert seen > 5
@@ -215,7 +214,7 @@ def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
     boundary, switch = safety_filter(certificate, plant, "boundary"), safety_filter(certificate, plant, "switch")
     rng = np.random.default_rng(7)
     seen = set()
-    for _ in range(300):
+    for _ in range(120):
         estimate, shape = certificate.safe_set.sample(rng) * rng.uniform(0, 1.2), 0.1 * certificate.Sigma
         u = rng.uniform(-1, 1, plant.m) * plant.u_max
         decision = boundary.decide(estimate, shape, u)
@@ -224,7 +223,7 @@ def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
         assert (decision.reason == "safe") is all_pass
         seen.add(decision.reason)
         if not all_pass:
-            np.testing.assert_array_equal(decision.input, boundary.fallback_input(estimate))
+            np.testing.assert_array_equal(decision.input, gained(boundary, estimate))
     assert "fallback" in seen
 
 
@@ -259,7 +258,7 @@ def random_cases(rng, shield, count):
     shapes = factor @ inner @ inner.swapaxes(1, 2) @ factor.T
     inputs = rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.u_max
     inputs[::7] = plant.u_max
-    inputs[::11] = [shield.fallback_input(estimate) for estimate in estimates[::11]]
+    inputs[::11] = [gained(shield, estimate) for estimate in estimates[::11]]
     estimates[3], estimates[4], estimates[5, 0], estimates[6] = 1e200, np.nan, np.inf, 0.0
     shapes[8], shapes[9], shapes[10], shapes[12, 0, 0] = 0.0, np.nan, -shapes[10], np.inf
     inputs[13, -1], inputs[14], inputs[15, 0] = np.nan, 1.1 * plant.u_max, -np.inf
@@ -334,22 +333,3 @@ def test_indefinite_error_shapes_of_three_states_are_unusable():
     skew = 1e-4 * np.eye(3) + np.array([[0.0, 1e-5, 0.0], [-1e-5, 0.0, 0.0], [0.0, 0.0, 0.0]])
     u = np.zeros(2)
     assert shield.margin(u[[0, 0, 0]], skew, u) == pytest.approx(shield.margin(u[[0, 0, 0]], skew.T, u), abs=1e-15)
-
-
-def test_boundary_trusts_weak_inputs_of_larger_plants_too():
-    plant = RANDOM["n=3 m=2 p=1"]
-    certificate = certificate_of(plant)
-    boundary, rng = safety_filter(certificate, plant, "boundary"), np.random.default_rng(0)
-    reasons = set()
-    for _ in range(200):
-        estimate = certificate.safe_set.sample(rng)
-        reasons.add(boundary.decide(estimate, 0.1 * certificate.Sigma, rng.uniform(-0.3, 0.3, 2)).reason)
-    assert reasons == {"safe", "fallback"}
-
-
-def test_empty_batches_give_empty_decisions(case):
-    plant, certificate = case
-    none = safety_filter(certificate, plant).decide_many(
-        np.zeros((0, plant.n)), certificate.Sigma, np.zeros((0, plant.m))
-    )
-    assert (none.input.shape, none.reason.shape, none.margin.shape) == ((0, plant.m), (0,), (0,))

@@ -16,7 +16,6 @@ from tests.product import (
     linear_plant,
     loop_env,
     safe_loop,
-    safety_filter,
     safety_shield,
     synthesize,
     vector_env,
@@ -107,13 +106,6 @@ def test_copy_of_a_loop_shares_nothing_with_it(certificate):
         own.receive()
         np.testing.assert_array_equal(loop.decide([4.0]).input, own.decide([4.0]).input)
         assert loop.guaranteed == own.guaranteed
-
-
-def test_batches_and_tensors_handed_to_a_filter_are_invalid(certificate):
-    shield = safety_filter(certificate, PLANT)
-    gradient = torch.zeros(1, requires_grad=True)
-    for estimate, proposed in ((np.zeros((5, 2)), np.zeros((5, 1))), (np.zeros(2), np.zeros((5, 1))), (TWO, gradient)):
-        assert shield.decide(estimate, certificate.Sigma, proposed).reason == "invalid"
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

@@ -91,7 +91,7 @@ class Repeats(gym.Wrapper):
         return result
 
 
-@pytest.mark.cases(8)
+@pytest.mark.cases(6)
 @pytest.mark.parametrize("mode", ["project", "lookahead", "boundary", "switch"])
 @pytest.mark.parametrize("name", INSIDE)
 def test_no_wrapper_inside_the_shield_breaks_its_promise(name, mode):
@@ -107,7 +107,7 @@ def test_no_wrapper_inside_the_shield_breaks_its_promise(name, mode):
             env.step(action)
             belief = env.unwrapped.belief
             assert np.abs(PLANT.box_rows @ env.unwrapped.state).max() <= 1.0
-            assert env.unwrapped.guard.reason == ""
+            assert env.unwrapped.guard.code == 0
             assert belief.applied.flags.writeable is False
             broken += bare.step(action)[4]["cost"]
     assert broken > 0
@@ -164,10 +164,11 @@ def test_a_loop_that_moves_without_its_guard_proves_nothing_until_the_next_reset
         assert np.all(shield.reset(seed=0)[1]["shield_guaranteed"])
         assert np.all(shield.step(action)[-1]["shield_guaranteed"])
         env._now.move(env.np_random, np.zeros(np.shape(env.belief.applied)))
-        for _ in range(3):
+        for states in (3, 4, 5):
             info = shield.step(action)[-1]
             assert np.all(info["shield_reason"] == OTHER_STEPS)
             assert not np.any(info["shield_guaranteed"])
+            assert np.all(info["episode_guaranteed"] == 2 / states)
 
 
 @pytest.mark.parametrize("made", [scalar, vector])
@@ -212,22 +213,6 @@ def test_an_input_without_its_step_ends_the_claim_also_where_others_begin(moves)
     assert info["shield_reason"].tolist() == ["", OTHER_STEPS]
     info = shield.step(np.zeros((2, 1)))[-1]
     assert info["shield_reason"].tolist() == ["", OTHER_STEPS]
-
-
-def test_a_step_that_fails_inside_a_partial_reset_is_no_episode_that_goes_on(monkeypatch):
-    shield = vector()
-    env, move = shield.unwrapped, shield.unwrapped._now.move
-
-    def drawn(rng):
-        with monkeypatch.context() as patch:
-            patch.setattr(env._now, "move", lambda *given: (move(*given), 1 / 0))
-            with pytest.raises(ZeroDivisionError):
-                env.step(np.ones((2, 1)))
-        return env.channel
-
-    shield.reset(seed=0)
-    with pytest.raises(gym.error.ResetNeeded):
-        shield.reset(options={"reset_mask": np.array([True, False]), "channel": drawn})
 
 
 @pytest.mark.parametrize("copied", [lambda env: env, copy.copy, *COPIES])

@@ -1,11 +1,9 @@
 import warnings
-from copy import deepcopy
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import VectorWrapper
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from ncs_gym import AdversarialDisturbance, Ellipsoid
@@ -13,7 +11,7 @@ from shields import SafetyShield
 from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
 )
-from tests.product import safety_shield, vector_shield
+from tests.product import safety_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 KEYS = {
@@ -123,66 +121,3 @@ def test_initial_set_that_leaves_the_safe_set_is_not_trusted(certificate):
     env = shielded(certificate, initial_set=Ellipsoid(4.5 * np.eye(2)))
     reasons = {env.reset(seed=seed)[1]["shield_reason"] for seed in range(40)}
     assert reasons == {"", NOT_KNOWN_INSIDE}
-
-
-def emptied(info):
-    """The same infos, with zeros written into their arrays."""
-    for value in info.values():
-        if isinstance(value, np.ndarray) and value.dtype != object:
-            value[...] = 0
-    return info
-
-
-REWRITES = {
-    "zeros": lambda info: emptied(deepcopy(info)),
-    "nothing": lambda info: {},
-    "written into": emptied,
-}
-
-
-def rewriting(kind):
-    """A wrapper of this kind that rewrites infos, at resets too."""
-
-    class Rewrites(kind):
-        def __init__(self, env, rewrite):
-            super().__init__(env)
-            self.rewrite = rewrite
-
-        def reset(self, **options):
-            observation, info = self.env.reset(**options)
-            return observation, self.rewrite(info)
-
-        def step(self, action):
-            *result, info = self.env.step(action)
-            return *result, self.rewrite(info)
-
-    return Rewrites
-
-
-@pytest.mark.cases(3)
-@pytest.mark.parametrize("rewrite", REWRITES)
-@pytest.mark.parametrize("autoreset", [None, pytest.param("NextStep", marks=pytest.mark.slow), "SameStep"])
-def test_no_rewritten_info_changes_a_decision_or_the_guarantee(certificate, autoreset, rewrite):
-    if autoreset is None:
-        make, shield, layer = gym.make, safety_shield, rewriting(gym.Wrapper)
-        settings = {}
-    else:
-        make, shield, layer = gym.make_vec, vector_shield, rewriting(VectorWrapper)
-        settings = {"num_envs": 5, "max_episode_steps": 25, "autoreset_mode": autoreset}
-    plain, inner, wrapped = (make(CRUISE, disturbance="adversarial", **settings) for _ in range(3))
-    plain, inside = shield(plain, certificate), shield(layer(inner, REWRITES[rewrite]), certificate)
-    outside = layer(shield(wrapped, certificate), REWRITES[rewrite])
-    for env in (plain, inside, outside):
-        env.reset(seed=0)
-    action, overridden = np.ones(plain.action_space.shape, np.float32), 0
-    for _ in range(60):
-        one = plain.step(action)[4]
-        for env in (inside, outside):
-            env.step(action)
-            np.testing.assert_array_equal(plain.unwrapped.belief.applied, env.unwrapped.belief.applied)
-            own = env.unwrapped.guard.info() if autoreset is None else {}
-            for key in KEYS.keys() & own.keys() - {"episode_interventions"}:  # which this call has counted again
-                np.testing.assert_array_equal(one[key], own[key])
-        assert np.all(one["shield_guaranteed"])
-        overridden += np.count_nonzero(one["shield_intervened"])
-    assert overridden > 10
