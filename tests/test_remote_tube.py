@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.remote_tube import STEPS, W, cart_pole_of_the_paper, episode, remote_shield, shield_at_plant
 from ncs_gym import ChannelContract
-from shields import synthesize
+from tests.product import synthesize
 
 
 @pytest.fixture(scope="module")
