@@ -186,3 +186,12 @@ def assert_printed(programs, printed):
     expected = [text for _, text in programs]
     shown = zip(printed.split("---\n"), expected, strict=True)
     assert [text for text, wanted in shown if wanted] == list(filter(None, expected))
+
+
+def test_every_statement_names_a_function_that_its_module_has():
+    rows = re.findall(r"^\| .+ \| (`.+`) \| (`.+`) \|$", (ROOT / "docs" / "shield_proof.md").read_text(), re.MULTILINE)
+    assert len(rows) >= 15
+    for names, modules in rows:
+        parts = zip(re.findall(r"`(\w+)`", names), re.findall(r"`([\w/.]+)`", modules), strict=True)
+        for name, module in parts:
+            assert hasattr(importlib.import_module(module.removesuffix(".py").replace("/", ".")), name), name
