@@ -6,6 +6,7 @@ Commands: measure, replicate, pages.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -165,6 +166,7 @@ def measure(
         numbers.parent.mkdir(parents=True, exist_ok=True)
         numbers.write_text(json.dumps(found, allow_nan=False) + "\n", "utf-8")
     print(all_tables(found))
+    print(f"{sum(os.times()[:4]) / 3600.0:.2f} hours of processor time")
 
 
 def replicate(

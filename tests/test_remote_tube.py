@@ -19,6 +19,7 @@ def test_the_plant_declares_all_disturbances_of_the_paper(plant):
     assert np.abs(np.linalg.eigvals(plant.A)).max() == pytest.approx(np.exp(0.02 * 4.5442), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_shield_at_the_plant_keeps_the_limits_whatever_is_lost(plant):
     certificate = synthesize(plant, contract=ChannelContract(0))
     by_packets, local = (shield_at_plant(plant, certificate, local=each) for each in (False, True))
@@ -28,6 +29,7 @@ def test_a_shield_at_the_plant_keeps_the_limits_whatever_is_lost(plant):
     assert np.isnan(episode(lambda *_: np.zeros(1), plant, 0.8, STEPS, 0, worst=True))
 
 
+@pytest.mark.slow
 def test_a_remote_shield_keeps_the_limits_within_its_contract_and_not_beyond(plant):
     certificate = synthesize(plant, contract=ChannelContract(3))
     assert episode(remote_shield(plant, certificate), plant, 0.9, 1, 0, worst=True) < 20.0
