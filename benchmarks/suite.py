@@ -95,7 +95,6 @@ SECONDARY = {
     "lagrangian:1": Entry("lagrangian:1", seeds=5),
     "unshielded, attacked": Entry("unshielded", attacked=True, seeds=5),
     "shielded, memory": Entry("shielded", observed="memory", seeds=5),
-    "lookahead": Entry("lookahead", seeds=5),
 }
 REGULATED = {
     "lqr": Entry("lqr", everywhere=True),
