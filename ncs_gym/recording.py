@@ -139,7 +139,7 @@ def bounds_from_recording(
 
     Args:
         model: The equations.
-        inputs: Of each step, shape (N, m), in the model's own units as the outputs.
+        inputs: Of each step, shape (N, m), absolute like the outputs, not deviations from the operating point.
         outputs: Sampled before the input, shape (N + 1, p), or (N, p), where the last input is not used.
         E: Directions of the disturbance, shape (n, q); the identity if None.
         sensor: Half-widths of sensor noise, a number or shape (p,), as of a data sheet.
