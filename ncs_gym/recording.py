@@ -107,9 +107,10 @@ class RecordedBounds(ReadOnlyArrays):
                 f"{100.0 * self.left[i]:8.3g}"
             )
         ends = f", unless one did within {counted(self.window, 'step')} of its ends" if self.window > 1 else ""
+        where = "" if np.isfinite(self.upper).all() else " where there is one"
         sentences = (
             'If the model is right, this record proves that disturbances as large as "at least" occurred, and none '
-            f'beyond "at most"{ends}.',
+            f'beyond "at most"{where}{ends}.',
             "It does not prove that none larger will occur: up to "
             f"{100.0 * self.left.max():.3g} % of the second half's steps may exceed all of the first half's (left).",
             "The factor that you declare is your claim, which further records on other days support, and more steps of "
@@ -138,7 +139,7 @@ def bounds_from_recording(
 
     Args:
         model: The equations.
-        inputs: Of each step, shape (N, m), in the model's own units as the outputs.
+        inputs: Of each step, shape (N, m), absolute like the outputs, not deviations from the operating point.
         outputs: Sampled before the input, shape (N + 1, p), or (N, p), where the last input is not used.
         E: Directions of the disturbance, shape (n, q); the identity if None.
         sensor: Half-widths of sensor noise, a number or shape (p,), as of a data sheet.

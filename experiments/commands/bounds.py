@@ -24,7 +24,8 @@ class BoundsSettings:
     Attributes:
         file: A table (CSV, or Parquet where pyarrow is installed) with the plant's inputs and outputs by name as
             columns and a row per step: outputs as sampled, then the input that acted, which may be empty in the last
-            row. An output that is not a state is y1, y2, ... by its number. Further columns are not read.
+            row; none as deviations from an operating point. An output that is not a state is y1, y2, ... by its number.
+            Further columns are not read.
         plant: File of the plant (`LinearPlant.save`). Its disturbance says along which directions to seek: E of
             Through(E, ...), else every state.
         sensor: Half-widths of the noise of each output, as of a data sheet; by default the plant's own.

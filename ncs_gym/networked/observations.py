@@ -133,7 +133,7 @@ class Entries:
     ) -> None:
         several: tuple[Any, ...] = tuple(names) if isinstance(names, list | tuple) else (names,)
         if any(name not in ENTRIES for name in several) or len(set(several)) < len(several):
-            raise ValueError(f"observe must be a list, each at most once, of {', '.join(ENTRIES)}, got {shown(names)}")
+            raise ValueError(f"observe must list, each at most once, some of {', '.join(ENTRIES)}, got {shown(names)}")
         self.names, self._inner, self._actions = several, observations, actions
         made = {
             "age": lambda: spaces.Box(0.0, OLDEST_OBSERVED, (parts,), np.float32),

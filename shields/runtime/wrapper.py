@@ -65,7 +65,10 @@ class _Shield(RecordConstructorArgs):
         read = None if certificate is None else Certificate.read(certificate)
         inner = self._inner = getattr(env, "unwrapped", env)
         if not isinstance(inner, self._inside):
-            raise ValueError(f"the shield needs an {self._inside.__name__} inside, got {type(inner).__name__}")
+            raise ValueError(
+                f"the shield needs an {self._inside.__name__} inside, got {type(inner).__name__}, which has no plant: "
+                "ncs_gym/LinearNCS-v0 takes one of yours (plant=)"
+            )
         certificate = certificate_for(inner.plant, inner.certificate_contract) if read is None else read
         judge = SafetyFilter(certificate, inner.plant, mode, horizon)
         self._guard: Guard

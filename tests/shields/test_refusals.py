@@ -31,9 +31,9 @@ def kept(name="stable", safe_set="ellipsoid"):
     return certificate_of(*named(name), safe_set)
 
 
-def synthesized(box, gamma=1e-4):
+def synthesized(box, gamma=1e-4, A=((0.9, 0.2), (0, 0.8))):
     noise = {"gamma": gamma, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
-    return synthesize(linear_plant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
+    return synthesize(linear_plant(A=A, B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
 
 
 def with_proofs(name, **changes):
@@ -75,6 +75,11 @@ REFUSED = [
         lambda: synthesized([1.0, 1e5], gamma=4.0),
         Infeasible,
         r"take no state to a hundredth of \|x2\| <= 1e\+05 in 2 steps: leave out limits that stand for none",
+    ),
+    (
+        lambda: synthesized([1.0, 1e5], A=[[1.0, 0.2], [0, 0.8]]),
+        Infeasible,
+        r"^\(E1\) cannot hold((?!limits that stand for none).)*$",
     ),
     (
         lambda: synthesized([[1.0, 1.0], [1.0, 1.0 + 1e-8]]),

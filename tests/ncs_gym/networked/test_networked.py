@@ -394,7 +394,7 @@ def test_channels_of_several_sensors_are_drawn_by_their_keys():
         ({"downlink": LATE, "neutral": 7}, "neutral must be an action, got 7"),
         (
             {"observe": "ages"},
-            "each at most once, of age, arrived, pending_actions, got 'ages'",
+            "each at most once, some of age, arrived, pending_actions, got 'ages'",
         ),
         ({"fill": "nothing"}, "fill must be 'last', 'zero' or a function"),
         ({"idle": "never"}, "idle must be one of 'hold', 'neutral', got 'never'"),
