@@ -215,6 +215,22 @@ def test_an_input_without_its_step_ends_the_claim_also_where_others_begin(moves)
     assert info["shield_reason"].tolist() == ["", OTHER_STEPS]
 
 
+def test_a_step_that_fails_inside_a_partial_reset_is_no_episode_that_goes_on(monkeypatch):
+    shield = vector()
+    env, move = shield.unwrapped, shield.unwrapped._now.move
+
+    def drawn(rng):
+        with monkeypatch.context() as patch:
+            patch.setattr(env._now, "move", lambda *given: (move(*given), 1 / 0))
+            with pytest.raises(ZeroDivisionError):
+                env.step(np.ones((2, 1)))
+        return env.channel
+
+    shield.reset(seed=0)
+    with pytest.raises(gym.error.ResetNeeded):
+        shield.reset(options={"reset_mask": np.array([True, False]), "channel": drawn})
+
+
 @pytest.mark.parametrize("copied", [lambda env: env, copy.copy, *COPIES])
 @pytest.mark.parametrize("made", [scalar, vector])
 def test_nobody_writes_into_what_a_guard_decides_from(made, copied):

@@ -6,12 +6,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ncs_gym import truck_trailer
+from ncs_gym import Ellipsoid, truck_trailer
 from shields.verification import Condition, Report
 from shields.verification.condition import matrix_condition, scalar_condition
 from tests.certificates import certificate_of
 from tests.plants import named
 from tests.product import altered, library_plant, paper_synthesis
+from tests.shields.verification.test_mutations import replaced
 from tests.verdicts import broken, verified
 
 BEYOND_FLOATS = Fraction(10) ** 400
@@ -81,6 +82,24 @@ def test_only_positive_definiteness_excludes_a_flat_set():
     flat = replace(certificate, L=np.zeros((2, 2)), K=np.zeros((1, 2)))
     found = broken(flat, plant)
     assert any("L > 0" in name for name in found)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("disturbance_bound", "D: the plant's"), ("sensor_bound", "N:"), ("initial_bound", "r0:")]
+)
+def test_sets_that_miss_a_bound_declared_beside_a_covariance_make_a_certificate_invalid(name, words):
+    bounds = {
+        "disturbance_bound": [0.03, 0.004],
+        "sensor_bound": [0.02, 0.03],
+        "initial_bound": ([[1.0, 0.2], [0.3, 0.4]], 0.02),
+    }
+    plant = library_plant(truck_trailer, 4000.0, initial_cov=np.diag([1e-4, 0.0]), gamma=1e-4, **bounds)
+    certificate = certificate_of(plant)
+    assert verified(certificate, plant).valid
+    larger = replaced(plant, **{name: Ellipsoid(1.001 * getattr(plant, name).shape_matrix)})
+    found = broken(certificate, larger)
+    assert len(found) == 1
+    assert found[0].startswith(words)
 
 
 def test_paper_certificate_proves_nothing_of_bounds_that_its_theorems_do_not_know():
