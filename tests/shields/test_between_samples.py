@@ -11,14 +11,14 @@ from scipy.linalg import expm
 
 from ncs_gym import Channel, Packet, truck_trailer
 from ncs_gym.network.downlink import downlink_protocol
-from shields import Certificate, verify
+from shields import Certificate, Infeasible, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import GuaranteeMonitor
 from shields.runtime.set_test import ellipsoid_test
 from shields.runtime.starts import starts_known
 from tests.certificates import certificate_of
-from tests.plants import swinging
+from tests.plants import named, swinging
 from tests.product import altered, belief, library_plant, safe_loop, safety_filter, sampled_plant
 from tests.second_verifier.verify import verify_again
 from tests.verdicts import verified
@@ -218,3 +218,8 @@ def test_a_step_that_nothing_proved_is_not_proved_by_where_it_led():
         held.append(not monitor.reasons(state))
         state = monitor.advance(state, decision, True, True, seen, errors)
     assert held == [True, False, False, False, True]
+
+
+def test_limits_that_bind_within_a_step_are_named_like_those_of_the_box():
+    with pytest.raises(Infeasible, match=r"those that bind: \|x2\| <= 4\)"):
+        certificate_of(*named("servo, at all times"))

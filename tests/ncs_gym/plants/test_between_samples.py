@@ -166,3 +166,17 @@ def test_model_in_continuous_time_is_the_one_that_was_sampled():
         with pytest.raises(ValueError, match="what A and B were sampled from"):
             altered(plant, **change)
     assert altered(plant, A=0.9 * plant.A, continuous_model=None).continuous_model is None
+
+
+def test_violation_between_samples_ends_an_episode_if_violations_do():
+    plant = altered(truck_trailer(mass=4000.0), between_samples=8)
+    env = gym.make(CRUISE, plant=plant, terminate_on_violation=True)
+    for seed in range(5):
+        env.reset(seed=seed)
+        terminated = False
+        for k in range(100):
+            *_, terminated, _, info = env.step(np.array([(-1.0) ** (k // 3)], np.float32))
+            assert terminated == (info["cost"] > 0.0)
+            if terminated:
+                break
+        assert terminated
