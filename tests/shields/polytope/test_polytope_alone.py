@@ -16,7 +16,7 @@ from shields.synthesis import polytope_certificates
 from shields.synthesis.invariant_polytope import share_in_polytope
 from shields.synthesis.polytope_certificates import certified_polytope
 from shields.synthesis.resting_point import at_operating_point
-from shields.synthesis.tolerance import Tolerance, most_tolerated, regulators
+from shields.synthesis.tolerance import Tolerance, most_tolerant, most_tolerated, regulators, tolerated_gains
 from shields.verification import verify
 from tests.certificates import certificate_of
 from tests.plants import named, servo, with_radii
@@ -129,3 +129,9 @@ def test_polytope_bears_more_than_an_ellipsoid():
     assert not synthesize(hardest, contract=AGE).keeps_ellipsoid
     with pytest.raises(Infeasible):
         synthesize(hardest, contract=AGE, safe_set="ellipsoid")
+
+
+def test_where_regulators_are_too_slow_to_tell_faster_ones_are_searched_up_to_what_the_plant_bears(monkeypatch):
+    monkeypatch.setattr(Tolerance, "improved", lambda tolerance, K: None)
+    gains = tolerated_gains(plant_of("spacecraft"), contract_of_plant("spacecraft"))
+    assert most_tolerant(gains).margin > 1.3  # with eigenvalues of at most .95 it is .01
