@@ -31,7 +31,7 @@ from agents.evaluation import Policy
 from agents.hyperparams import DEFAULTS, complete_hyperparams, with_changes
 from agents.loop import LagrangianSettings
 from benchmarks.commands import run, some_of
-from benchmarks.suite import ENTRIES, REGULATED, TASKS, observing, rows_of
+from benchmarks.suite import ENTRIES, TASKS, observing, rows_of
 from benchmarks.timing import timed
 from experiments.baselines.controllers import OBSERVER, RegulatorWeights, controller
 from experiments.commands.compare import CompareSettings
@@ -266,7 +266,7 @@ def tune_arms(
 
         def best(arm: str, tries: list[dict[str, Any]], loop: LoopConfig = loop, own: Certificate = certificate) -> Any:
             """Returns what gave the highest mean return, and prints it."""
-            is_trained = arm not in REGULATED
+            is_trained = Arm.of(arm.partition(", ")[0]).is_trained
             number, measure = (4 * episodes, _trained_arm) if is_trained else (episodes, _regulated_arm)
             returns = [
                 results.of([loop.env, arm, number, each], lambda each=each: measure(loop, arm, own, each, number))
@@ -278,7 +278,7 @@ def tune_arms(
             return found
 
         for arm in (each for each in arms if each in needed):
-            if arm in REGULATED:
+            if not Arm.of(arm.partition(", ")[0]).is_trained:
                 found = best(arm, grid(arm))
             else:
                 price = PRICES if arm == "penalized" else {}

@@ -87,6 +87,7 @@ PRIMARY = {
     "shielded, disturbance": Entry("shielded", observed="disturbance"),
     "shield at test": Entry("unshielded", "shielded", everywhere=True),
     "shield in training": Entry("shielded", "unshielded", everywhere=True),
+    "lqr:observer+shielded": Entry("lqr:observer+shielded", everywhere=True),
 }
 SECONDARY = {
     "penalized": Entry("penalized", seeds=5),
@@ -102,7 +103,6 @@ REGULATED = {
     **{name: Entry(name) for name in ("mpc:20", "mpc:40", "mpc:observer")},
     **{f"lqr+{name}": Entry(f"lqr+{name}") for name in ("trusting:20", "psf:20", "psf:tube")},
     "lqr+shielded": Entry("lqr+shielded", everywhere=True),
-    "lqr:observer+shielded": Entry("lqr:observer+shielded", everywhere=True),
     "lqr:observer+ellipsoid": Entry("lqr:observer+shielded", safe_set="ellipsoid"),
     "lqr:observer+lookahead": Entry("lqr:observer+lookahead"),
 }
@@ -465,7 +465,6 @@ def differences_table(found: dict[str, Any]) -> str:
     """Returns the sentences about who is better, as numbers of both blocks: see the page."""
     pairs = (
         ("violating", ATTACKED, 100.0, "unshielded", "shielded"),
-        ("return", AS_TRAINED, 1.0, "shielded", "shield at test"),
         ("return", AS_TRAINED, 1.0, "shielded, disturbance", "shielded"),
         ("return", AS_TRAINED, 1.0, "lqr:observer+shielded", "shielded, disturbance"),
         ("return", AS_TRAINED, 1.0, "lqr:observer+shielded", "shielded"),

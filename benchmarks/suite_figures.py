@@ -17,7 +17,7 @@ from experiments.runs.loops import AS_TRAINED
 ATTACKED = "attacked"
 # What the figures compare; regulators stand below a line.
 _VIOLATING = ("unshielded", "trusting:20", "shielded", "lqr", "mpc:20", "lqr+trusting:20", "lqr:observer+shielded")
-_RETURNS = ("unshielded", "shield at test", "shielded", "shielded, disturbance", "lqr", "lqr:observer+shielded")
+_RETURNS = ("unshielded", "shielded", "shielded, disturbance", "lqr", "lqr:observer+shielded")
 _TRAINED = ("unshielded", "trusting:20", "shielded")
 # Width of a panel, height of a row and of a panel of curves, what titles take [inches].
 _PANEL, _ROW, _CURVES, _TITLES = 2.9, 0.27, 2.2, 0.9

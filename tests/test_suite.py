@@ -145,7 +145,7 @@ def test_a_small_suite_keeps_its_runs_trains_once_and_nothing_breaks_the_shield(
         with pytest.raises(ValueError, match="has other blocks, runs, steps or episodes"):
             made("unshielded", steps=1600)
     first, second = found["tasks"]["CSTR-v0"].values()
-    assert set(second) == {"unshielded", "shielded", "shield at test"}
+    assert set(second) == {"unshielded", "shielded", "shield at test", "lqr:observer+shielded"}
     assert first["unshielded"]["curve"] == first["shield at test"]["curve"]  # the same agents
     assert first["unshielded"]["training"] != first["unshielded, attacked"]["training"]
     for block in (first, second):
