@@ -76,7 +76,6 @@ test-slow: $(INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks,
 SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_paper.py tests/test_suite.py \
 	tests/experiments/commands/test_requirements.py \
 	tests/test_published_plants.py \
-	tests/shields/synthesis/test_hints.py::test_a_contract_is_named_where_a_stable_plant_has_none \
 	tests/hardening/test_determinism.py::test_same_seed_gives_the_same_bits_in_every_process \
 	tests/hardening/test_portability.py::test_operating_points_that_are_found_are_the_same_under_other_kernels \
 	tests/experiments/backends/test_execution.py \

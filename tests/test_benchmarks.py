@@ -85,3 +85,11 @@ def test_an_hour_without_an_end_says_what_it_rules_out():
     assert networks.Measured(0, 1.0, 1.0).interval == pytest.approx((0.0, -np.log(0.025)))
     low, high = networks.Measured(40, 2.0, 1.0).interval  # 40 ends: Garwood's interval is [28.58, 54.47]
     assert (low, high) == pytest.approx((28.58 / 2.0, 54.47 / 2.0), abs=5e-3)
+
+
+def test_the_fixed_part_of_the_long_tests_exists():
+    part = re.search(r"^SLOW_PART \?= ((?:.*\\\n)*.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert part
+    for each in part[1].replace("\\\n", " ").split():
+        file, _, test = each.partition("::")
+        assert f"def {test}" in (ROOT / file).read_text() if test else (ROOT / file).exists(), each
