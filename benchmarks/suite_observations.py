@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,8 +46,8 @@ class Remembered:
         return WithMemory(envs, self.steps)
 
 
-class WithMore(AroundEnvironments, VectorWrapper):
-    """Observations with more entries behind them, between -1 and 1 or as large as low and high.
+class WithMore(AroundEnvironments, VectorWrapper, ABC):
+    """Observations with more entries behind them.
 
     Args:
         env: A vector environment of this package.
@@ -61,9 +62,9 @@ class WithMore(AroundEnvironments, VectorWrapper):
         self.single_observation_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
+    @abstractmethod
     def more(self, observations: np.ndarray, infos: dict[str, Any], fresh: np.ndarray) -> np.ndarray:
         """Returns the entries, shape (N, more); loops that are not fresh have not moved since the last call."""
-        raise NotImplementedError
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None

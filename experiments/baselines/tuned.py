@@ -1,4 +1,4 @@
-"""What was tuned for each arm of the study by itself, with the same budget for all (`benchmarks.learning`)."""
+"""What was tuned for each arm of the benchmark by itself, with the same budget for all (`benchmarks.learning`)."""
 
 from __future__ import annotations
 
