@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
@@ -278,8 +279,10 @@ def tolerated_gains(plant: LinearPlant, contract: ChannelContract | None) -> lis
     _, errors = design_problem(plant, contract, limits_around(plant, rest))
     tolerance = Tolerance(plant, errors.promised, disturbance_around(plant, rest))
     gains = []
-    for K, *faster in zip(regulators(plant), *(regulators(plant, each) for each in _FASTER), strict=False):
-        found = tolerance.of(K) or most_tolerant([*filter(None, map(tolerance.of, faster))])
+    # What no input moves may be slower than those that are faster: of these there may be none.
+    for K, *faster in zip_longest(regulators(plant), *(regulators(plant, each) for each in _FASTER)):
+        others = [found for each in faster if each is not None and (found := tolerance.of(each))]
+        found = (None if K is None else tolerance.of(K)) or most_tolerant(others)
         gains += [] if found is None else [found]
     best = most_tolerant(gains)
     return gains if best is None else [*filter(None, [tolerance.improved(best.K)]), *gains]

@@ -20,7 +20,7 @@ from shields.synthesis.tolerance import Tolerance, most_tolerant, most_tolerated
 from shields.verification import verify
 from tests.certificates import certificate_of
 from tests.plants import named, servo, with_radii
-from tests.product import synthesize
+from tests.product import linear_plant, synthesize
 from tests.verdicts import verified
 
 AGE = ChannelContract(3)
@@ -135,3 +135,18 @@ def test_where_regulators_are_too_slow_to_tell_faster_ones_are_searched_up_to_wh
     monkeypatch.setattr(Tolerance, "improved", lambda tolerance, K: None)
     gains = tolerated_gains(plant_of("spacecraft"), contract_of_plant("spacecraft"))
     assert most_tolerant(gains).margin > 1.3  # with eigenvalues of at most .95 it is .01
+
+
+def test_a_state_that_no_input_moves_may_be_slow():
+    plant = linear_plant(
+        A=[[1.02, 0.1], [0.0, 0.99]],
+        B=[[0.1], [0.0]],
+        H=np.eye(2),
+        dt=0.1,
+        box=np.eye(2),
+        u_max=[1.0],
+        disturbance_bound=1e-3,
+        sensor_bound=1e-4,
+        initial_bound=1e-3,
+    )
+    assert synthesize(plant, contract=ChannelContract(2))
