@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -23,6 +22,7 @@ from ncs_gym.envs.report import Belief
 from ncs_gym.uncertainty.ellipsoid import UncertainSet
 from ncs_gym.validation import as_setting
 from shields import Certificate
+from shields.runtime.set_test import PredictedErrors
 
 _SOURCES = (
     ("disturbance", "process_noise_cov", "disturbance_bound"),
@@ -31,12 +31,15 @@ _SOURCES = (
 )
 
 
-def belief(estimate: np.ndarray, alarm: Any = False, *, stays: bool = True) -> Belief:
-    """What a monitor is told of one loop, or of N, whose error sets are certified to stay (`stays`) or not."""
-    many = estimate.ndim > 1
-    table: Any = SimpleNamespace(is_certified=lambda _: stays, certified=np.array([stays]))
-    number = np.zeros(estimate.shape[1], np.intp) if many else 0
-    return Belief(estimate, number, table, 0, alarm, False, False, estimate, estimate)
+def belief(estimate: np.ndarray, alarm: Any = False) -> Belief:
+    """What a monitor is told of one loop, or of N."""
+    table: Any = None
+    return Belief(estimate, 0, table, 0, alarm, False, False, estimate, estimate)
+
+
+def staying(errors: PredictedErrors) -> PredictedErrors:
+    """The same, with error sets that are known to stay where they are certified."""
+    return errors._replace(stays=np.ones_like(errors.certified) if np.ndim(errors.certified) else True)
 
 
 def linear_plant(**described: Any) -> LinearPlant:

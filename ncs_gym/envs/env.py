@@ -237,7 +237,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         self._task_state = self._task.begin(self._task_random, self.plant)
         info, guard = self._info(no_inputs(self.plant.m), False), self._guard
         if guard is not None:
-            guard.begin(now.beginning(self._belief))
+            guard.begin(self._belief, *now.beginning())
             info |= guard.info()
         self._consistent, self._over = True, False
         if self.renderer is not None:
@@ -261,8 +261,9 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         if self._over:
             raise gym.error.ResetNeeded("the episode is over, as the step before said: call reset")
         self._consistent = False
-        guard = self._guard
-        u = read[1] if guard is None else guard.input(read[1])
+        guard, u = self._guard, read[1]
+        if guard is not None and (decided := guard.decide(u)).intervened:
+            u = decided.input
         inputs, arrived = now.move(self.np_random, u)
         self._task_state = self._task.advance(self._task_random, self.plant, self._task_state, inputs.applied)
         reward = self._task.reward_one(self.plant, self._task_state, now.state, inputs.applied)
@@ -332,7 +333,7 @@ def note_of(guard: Any, info: dict[str, Any]) -> Annotation | None:
         intervened=bool(info["shield_intervened"]),
         interventions=int(info["episode_interventions"]),
         protects=judge.mode != "monitor",
-        plan=guard.plan() if judge.mode == "lookahead" else None,
+        plan=guard.stored.copy() if judge.mode == "lookahead" else None,
     )
 
 

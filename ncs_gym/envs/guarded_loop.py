@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.envs.episode_channels import EpisodeChannels
-from ncs_gym.envs.info import loop_info
+from ncs_gym.envs.info import actions_of, loop_info
 from ncs_gym.envs.loop import Loop, LoopState
 from ncs_gym.envs.report import Belief
-from ncs_gym.envs.spaces import actions_of
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.network.channel import Channel, require_on_request
 from ncs_gym.network.contract import ChannelContract, largest_age
@@ -47,7 +46,7 @@ class GuardedLoop:
     _now: LoopState
     _task_random: Any = None
     _belief: Belief
-    # What decides the inputs: `shields.runtime.guard`. A step is `input` and then `observe`, a start is `begin`; `info`
+    # What decides the inputs: `shields.runtime.guard`. A step is `decide` and `observe`, a start is `begin`; `info`
     # follows, and what it lost is told last, when the step has happened. None for an environment without a shield.
     _guard: Any = None
     # Whether there is an episode that no exception has interrupted.

@@ -8,6 +8,9 @@ import numpy as np
 
 from ncs_gym.envs.loop import Loop
 from ncs_gym.envs.report import Report
+from ncs_gym.envs.spaces import nearest_action
+from ncs_gym.network.downlink import Inputs
+from ncs_gym.plants.linear_plant import LinearPlant
 
 # What is a number in the info of one environment, and of many an array that the environments go on using.
 SHARED = (
@@ -54,3 +57,18 @@ def loop_info(report: Report, loop: Loop, actions: tuple[np.ndarray, np.ndarray]
             if key in info:
                 info[key] = info[key].copy()
     return info
+
+
+def actions_of(
+    inputs: Inputs, plant: LinearPlant, read: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the float32 actions that stand for the inputs applied and committed, shape (m,) or (N, m) each.
+
+    If what `read_action` returned was decided, the action is the one that was given.
+    """
+    if read is not None and inputs.committed is inputs.applied is read[1] and read[0].dtype.char == "f":
+        return read[0], read[0].copy()
+    applied = nearest_action(inputs.applied.T, plant)
+    if inputs.committed is inputs.applied:  # as without a downlink
+        return applied, applied.copy()
+    return applied, nearest_action(inputs.committed.T, plant)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.loop_settings import expect, loop_contracts, starting_set
-from ncs_gym.envs.report import Beginning, Belief, Report
+from ncs_gym.envs.report import Belief, Report
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
@@ -175,7 +176,8 @@ class LoopState(CopiedWhole, ABC):
             self.requests.decide(self.estimator.age)
             # A sensor that has not heard whether a sample is requested takes it.
             requested = self.requests.decided[0] | inputs.missing
-        self.state = self.process.advance(rng, before, inputs.applied, self.steps, self.memory)
+        self.state = self.process.advance(rng, before, inputs.applied, self.steps, self.memory).view()
+        self.state.flags.writeable = False  # tasks, which read it, are code of others
         self.worst = self.loop.plant.worst_constraint_values(before, inputs.applied, self.state)
         self.steps = self.steps + 1
         return inputs, self._receive(rng, inputs.applied, requested)
@@ -200,28 +202,31 @@ class LoopState(CopiedWhole, ABC):
             if self.requests is None:
                 asked = forced = self.nothing
         self.violations = self.violations + (cost if counted is None else cost * counted)
-        (applied, committed, missing), table = inputs, estimator.table
+        (applied, committed, missing), table = inputs, estimator.histories.table
         belief = Belief(estimate, number, table, age, alarm, damaged, outside, applied, committed, self.moves)
         happened = belief, self.steps, self.state, estimator.mean, arrived, self.packets
         kept = values, worst, cost, self.violations
-        return Report(*happened, *kept, missing, asked, forced, self._others | self.process.infos)
+        others, parameters = self._others, self.process.process.parameters
+        if parameters is not None:
+            others = others | {"parameters": parameters}
+        return Report(*happened, *kept, missing, asked, forced, others)
 
     @property
     def pending(self) -> tuple[np.ndarray, ...]:
         """The inputs until the next decision takes effect, shape (m,) or (m, N) each."""
         return self.downlink.committed.pending
 
-    def ahead(self, *chosen: np.ndarray) -> list[tuple[np.ndarray, Any]]:
-        """Returns estimate and number of the error set of now and of every step before the next decision's effect.
+    def beginning(self, *chosen: np.ndarray) -> tuple[Any, list[tuple[np.ndarray, Any]], Sequence[Channel]]:
+        """Returns what a guard is told where episodes begin, of N loops those with these indices.
 
-        Args:
-            chosen: Indices of the loops that count, of N; all by default.
+        That is what the start is known to lie in, an ellipsoid or the state itself, of N loops a list of these;
+        estimate and number of the error set of every step before the first decision takes effect; the channels.
         """
-        return [self.estimator.numbered(self.pending[:steps], *chosen) for steps in range(len(self.pending))]
-
-    def beginning(self, belief: Belief, *chosen: np.ndarray) -> Beginning:
-        """Returns what a guard is told where episodes begin, of N loops those with these indices."""
-        return Beginning(belief, self.start, self.ahead(*chosen), self.channels.now)
+        starts, initial = self.start, self.loop.initial_set
+        if chosen:
+            starts = [initial if np.isnan(start[0]) else start for start in starts[chosen[0]]]
+        earlier = [self.estimator.numbered(self.pending[:steps], *chosen) for steps in range(len(self.pending))]
+        return starts, earlier, self.channels.now
 
     # Of one loop or of many: those of the classes below.
     nothing: Any = False

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym.estimation.error_table import ErrorTable
-from ncs_gym.network.channel import Channel
 from ncs_gym.validation import frozen
 
 
@@ -49,40 +47,20 @@ class Belief(NamedTuple):
         return _loaded_belief, tuple(self)
 
     @property
-    def stays(self) -> Any:
-        """Whether an error in a certified set is known to stay there while the contract is kept, of one loop or N."""
-        if self.estimate.ndim == 1:
-            return self.table.is_certified(self.number)
-        return self.table.certified.take(self.number)
-
-    @property
     def error_shape(self) -> np.ndarray:
         """Sigma_k, shape (n, n) and read-only, or a fresh array of shape (N, n, n)."""
         if self.estimate.ndim == 1:
             return self.table.shape(self.number)
         return self.table.shapes.take(self.number, axis=0)
 
+    def column(self, loop: int) -> Belief:
+        """Returns what is known of one of N loops."""
+        one = (each.take(loop, axis=-1) if isinstance(each, np.ndarray) else each for each in self)
+        return self._make(each.item() if isinstance(each, np.generic) else each for each in one)
+
 
 def _loaded_belief(*values: Any) -> Belief:
     return Belief._make(frozen(each) if isinstance(each, np.ndarray) else each for each in values)
-
-
-class Beginning(NamedTuple):
-    """What a guard is told where episodes begin.
-
-    Attributes:
-        belief: What a controller can know.
-        start: What the start is known to lie in, an ellipsoid or the state itself; of N loops, states that episodes
-            were started at by an option or outside the initial set, NaN elsewhere, shape (N, n).
-        earlier: Estimate and number of the error set of every step before the first decision takes effect; of N loops
-            of those that begin alone.
-        channels: Those of the present episodes.
-    """
-
-    belief: Belief
-    start: Any
-    earlier: list[tuple[np.ndarray, Any]]
-    channels: Sequence[Channel]
 
 
 class Report(NamedTuple):

@@ -10,7 +10,6 @@ from gymnasium.spaces import Box
 
 from ncs_gym.envs.report import Belief
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.network.downlink import Inputs
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
@@ -103,21 +102,6 @@ def nearest_action(inputs: np.ndarray, plant: LinearPlant) -> np.ndarray:
         return np.array([min(max(each, -1.0), 1.0) for each in scaled], np.float32)
     actions = (inputs - plant.input_middle) / plant.input_half
     return np.minimum(np.maximum(actions, -1.0), 1.0).astype(np.float32)
-
-
-def actions_of(
-    inputs: Inputs, plant: LinearPlant, read: tuple[np.ndarray, np.ndarray] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the float32 actions that stand for the inputs applied and committed, shape (m,) or (N, m) each.
-
-    If what `read_action` returned was decided, the action is the one that was given.
-    """
-    if read is not None and inputs.committed is inputs.applied is read[1] and read[0].dtype.char == "f":
-        return read[0], read[0].copy()
-    applied = nearest_action(inputs.applied.T, plant)
-    if inputs.committed is inputs.applied:  # as without a downlink
-        return applied, applied.copy()
-    return applied, nearest_action(inputs.committed.T, plant)
 
 
 def expressible(inputs: np.ndarray, plant: LinearPlant) -> np.ndarray:

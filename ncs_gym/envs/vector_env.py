@@ -161,7 +161,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
     def _move(self, u: np.ndarray) -> Moved:
         """Returns what a step returns in which no episode begins, given the inputs proposed, shape (m, N)."""
         now, guard = self._now, self._guard
-        u = u if guard is None else guard.input(u)
+        u = u if guard is None else guard.decide(u).input
         inputs, arrived = now.move(self.np_random, u)
         applied = inputs.applied
         self._task_state = self._task.advance_many(self._task_random, self.plant, self._task_state, applied)
@@ -189,7 +189,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         self._task_state = np.array(begun) if mask.all() else with_columns(self._task_state, mask, begun)
         info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
         if self._guard is not None:
-            self._guard.begin(now.beginning(self._belief, np.flatnonzero(mask)), mask)
+            self._guard.begin(self._belief, *now.beginning(np.flatnonzero(mask)), mask)
             info |= self._guard.info()
         return self._observation(), info
 

@@ -87,7 +87,9 @@ class ErrorTable:
 
     def shape(self, number: int) -> np.ndarray:
         """Returns an error shape Sigma_k, shape (n, n), read-only."""
-        return frozen(self._shapes[number])
+        shape = self._shapes[number]
+        shape.flags.writeable = False
+        return shape
 
     def statistics(self, number: int) -> ErrorStatistics:
         """Returns statistics by their number, read-only.

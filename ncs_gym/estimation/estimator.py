@@ -52,7 +52,8 @@ class PastSteps(CopiedWhole):
 
     def _predict(self, u: np.ndarray, samples: np.ndarray | None) -> None:
         """Moves the mean one step on with an input, (m,) or (m, N)."""
-        self.mean = frozen(self._predicted(self.mean, u))
+        self.mean = self._predicted(self.mean, u)
+        self.mean.flags.writeable = False
         self._priors.appendleft(self.mean)
         self._inputs.appendleft(u)
         self._samples.appendleft(samples)

@@ -149,7 +149,7 @@ class DownlinkState:
 
     def exchange(self, rng: np.random.Generator, step: int, u: np.ndarray) -> Inputs:
         """Takes the input decided at a step, shape (m,), which nobody writes to then, and returns what is applied."""
-        frozen(u)
+        u.flags.writeable = False
         if self._channel is None:
             return Inputs(u, u, False)
         self.committed.commit(u)

@@ -102,12 +102,6 @@ class PlantSimulation:
         self.process_noise = BlockSampler(self._draw_process_noise, size)
         self.alarm: Any = False if size is None else np.zeros(size, np.bool_)
 
-    @property
-    def infos(self) -> dict[str, np.ndarray]:
-        """What infos say of the process: the parameters of a family's member, a fresh array."""
-        parameters = self.process.parameters
-        return {} if parameters is None else {"parameters": parameters}
-
     def read_parameters(self, given: Any) -> np.ndarray | None:
         """Returns what `Process.read_parameters` does, anywhere if assumptions may be violated."""
         return self.process.read_parameters(given, anywhere=self._allow)

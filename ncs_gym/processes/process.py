@@ -43,10 +43,8 @@ class Process:
         """
         return self
 
-    @property
-    def parameters(self) -> np.ndarray | None:
-        """Those of the present episode, shape (k,), or of N, (N, k); None if episodes do not differ."""
-        return None
+    # Those of the present episode, shape (k,), or of N, (N, k); None if episodes do not differ.
+    parameters: Any = None
 
     def read_parameters(self, given: Any, *, anywhere: bool = False) -> np.ndarray | None:
         """Returns what an option of `reset` fixes of the parameters of episodes (`Family.read`)."""

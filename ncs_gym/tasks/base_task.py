@@ -103,7 +103,7 @@ class Task(ReadOnlyArrays, ABC):
 
     def reward_one(self, plant: LinearPlant, task_state: Any, state: np.ndarray, u: np.ndarray) -> float:
         """Returns `reward` of a read-only state; raises ValueError if it is no number (infinity is one)."""
-        value = self.reward(plant, task_state, guarded(state), u)
+        value = self.reward(plant, task_state, state, u)
         try:
             reward = nan if getattr(value, "ndim", 0) else float(value + 0.0)
         except (TypeError, ValueError):
@@ -114,7 +114,6 @@ class Task(ReadOnlyArrays, ABC):
 
     def reward_many(self, plant: LinearPlant, task_state: np.ndarray, state: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns `reward_one` for states (n, N) and inputs (m, N), shape (N,)."""
-        state = guarded(state)
         if not self.vectorized:
             each = zip(task_state, state.T, u.T, strict=True)
             with storing_nothing(self):

@@ -214,7 +214,7 @@ class GuaranteeMonitor:
                 broken = first_broken(broken, _not(inside), LEFT_MODEL)
         if self._input_delay or self._within_step:
             wait = longer_wait(np.maximum(wait - 1, 0), inside & on_the_way, self._input_delay)
-        return MonitorState(broken, inside, errors.certified, belief.stays, wait)
+        return MonitorState(broken, inside, errors.certified, errors.stays, wait)
 
 
 def longer_wait(wait: Any, proved: Any, ahead: int) -> Any:

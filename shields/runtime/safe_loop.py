@@ -33,9 +33,8 @@ from ncs_gym.validation import (
 from shields.certificate import Certificate
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import EXPLANATIONS, LATE_INPUT, NOT_CONFIRMED, OTHER_EPISODE, OTHER_INPUT
-from shields.runtime.guard import OneGuard
+from shields.runtime.guard import Guard
 from shields.runtime.safety_filter import SafetyFilter
-from shields.runtime.starts import starts_known
 
 NOT_STARTED = "no episode is under way: call start"
 
@@ -127,7 +126,7 @@ class SafeLoop(CopiedWhole):
         histories = arrival_histories(plant, channel, self._contract)
         self._estimator = Estimator(plant, channel, histories=histories)
         protocol = downlink_protocol(downlink, downlink_contract)
-        self._guard, self._decided = OneGuard(self._filter, protocol, on_unproved), np.zeros(plant.m)
+        self._guard, self._decided = Guard(self._filter, protocol, on_unproved), np.zeros(plant.m)
         self._input_delay = protocol.input_delay
         warn_of_broken_contract(self._contract, channel, self._input_delay, counts_losses=True)
         self._inputs = CommittedInputs(self._input_delay, plant.m)
@@ -163,7 +162,6 @@ class SafeLoop(CopiedWhole):
             initial_set = as_vector(initial_set, n, "initial_set")
         if isinstance(initial_set, Ellipsoid) and initial_set.dim != n:
             raise ValueError(f"initial_set must have dimension {n}, got {initial_set.dim}")
-        inside = starts_known(self._filter, initial_set, self._input_delay)
         self._phase = _Phase.STOPPED
         self._estimator.reset(mean)
         self._discarded = DiscardedPackets()
@@ -173,9 +171,8 @@ class SafeLoop(CopiedWhole):
             self._requests.begin()
         pending = self._inputs.pending
         earlier = [self._estimator.numbered(pending[:steps]) for steps in range(self._input_delay)]
-        self._guard.start(self._belief(None), inside, earlier)
+        self._guard.begin(self._belief(None), initial_set, earlier)
         self._phase = _Phase.STARTED
-        self._guard.lost.begin()
         self._guard.lost.tell_of(self.reason)
 
     @np.errstate(all="ignore")
@@ -328,7 +325,7 @@ class SafeLoop(CopiedWhole):
     @property
     def plan_length(self) -> int:
         """Number of inputs stored for the steps after this decision; 0 in other modes than "lookahead"."""
-        return 0 if self._phase is _Phase.STOPPED else len(self._guard.plan())
+        return 0 if self._phase is _Phase.STOPPED else len(self._guard.stored)
 
     @property
     def estimate(self) -> np.ndarray:

@@ -25,7 +25,6 @@ from shields.runtime.set_test import (
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
-    from ncs_gym.estimation.error_table import ErrorTable
     from shields.runtime.backup_plans import Lookahead
 
 MODES = ("project", "switch", "boundary", "monitor", "lookahead")
@@ -357,40 +356,3 @@ def _as_array(value: Any) -> np.ndarray:
 def _as_column(array: np.ndarray, size: int) -> np.ndarray:
     """Returns a batch of one, shape (size, 1); NaN for an array of another shape."""
     return array[:, None] if array.shape == (size,) else np.full((size, 1), np.nan)
-
-
-class NumberedErrors:
-    """What a filter knows of the error shapes of estimators, by the numbers that these have for them.
-
-    A number belongs to a table, in which it never changes its meaning; with another table all is looked up anew.
-    """
-
-    def __init__(self, safety_filter: SafetyFilter) -> None:
-        self._filter = safety_filter
-        self._table: ErrorTable | None = None
-        self._alone: dict[int, PredictedErrors] = {}
-        self._known: PredictedErrors
-
-    def of(self, table: ErrorTable, number: Any) -> PredictedErrors:
-        """Returns what is known of an error shape, without a last axis, or of N, numbers of shape (N,)."""
-        if table is not self._table:
-            self._take(table)
-        if isinstance(number, np.ndarray):
-            return self._many(table, number)
-        errors = self._alone.get(number)
-        if errors is None:
-            if len(self._alone) >= MOST_REMEMBERED:
-                self._alone.clear()
-            errors = self._alone[number] = self._filter.errors_of(table.shape(number))
-        return errors
-
-    def _many(self, table: ErrorTable, numbers: np.ndarray) -> PredictedErrors:
-        known = self._known
-        if len(table.shapes) > len(known.radius):
-            known = known.followed_by(self._filter.errors_of_many(table.shapes[len(known.radius) :]))
-            self._known = known
-        return known.of(numbers)
-
-    def _take(self, table: ErrorTable) -> None:
-        self._alone, self._known = {}, self._filter.errors_of_many(table.shapes[:0])
-        self._table = table  # last: if this is interrupted, nothing is known of either table

@@ -151,6 +151,7 @@ class SetTest:
             half_widths=np.ascontiguousarray((half_widths + unusable[:, None]).T),
             own=np.ascontiguousarray(own + unusable),
             certified=inside & usable,
+            stays=np.zeros(len(usable), np.bool_),
             shape=np.ascontiguousarray(shapes.transpose(1, 2, 0)),
         )
 
@@ -353,6 +354,7 @@ class PredictedErrors(NamedTuple):
         own: Bound of the largest error norm, sqrt(lambda_max(M Sigma_k)), shape (1, k); of a polytope
             sqrt(g Sigma_k g'), shape (r, k).
         certified: Whether E(Sigma_k) lies inside a certified error set, shape (k,).
+        stays: Whether it is known to stay in one while the contract is kept, which no shape alone says, shape (k,).
         shape: Sigma_k itself, shape (n, n, k); the filter keeps it in mode "lookahead" alone, else (0, n, k).
     """
 
@@ -362,6 +364,7 @@ class PredictedErrors(NamedTuple):
     half_widths: np.ndarray
     own: np.ndarray
     certified: Any
+    stays: Any
     shape: np.ndarray
 
     def of(self, numbers: np.ndarray) -> Self:

@@ -14,7 +14,7 @@ from ncs_gym import BrokenContractWarning, Channel, NCSEnv, NCSVectorEnv
 from ncs_gym.validation import AroundEnvironments, as_number, setting, shown, warn_caller
 from shields.certificate import Certificate
 from shields.packaged_certificates import certificate_for
-from shields.runtime.guard import Guard, ManyGuards, OneGuard
+from shields.runtime.guard import Guard
 from shields.runtime.safety_filter import SafetyFilter, plan_horizon
 
 
@@ -71,14 +71,9 @@ class _Shield(RecordConstructorArgs):
             )
         certificate = certificate_for(inner.plant, inner.certificate_contract) if read is None else read
         judge = SafetyFilter(certificate, inner.plant, mode, horizon)
-        self._guard: Guard
-        if isinstance(inner, NCSEnv):
-            self._guard = OneGuard(judge, inner.downlink_protocol, on_unproved)
-            self._guard.look_at([inner.channel])
-        else:
-            initial, count = inner.initial_set, inner.num_envs
-            self._guard = ManyGuards(judge, inner.downlink_protocol, initial, on_unproved, count)
-            self._guard.look_at(inner.episode_channels)
+        size = None if isinstance(inner, NCSEnv) else inner.num_envs
+        self._guard = Guard(judge, inner.downlink_protocol, on_unproved, size)
+        self._guard.look_at([inner.channel] if size is None else inner.episode_channels)
         self.penalty = penalty
         if (promised := certificate.contract) is not None and inner.certificate_contract is None:
             warn_caller(

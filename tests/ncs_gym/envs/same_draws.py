@@ -105,7 +105,7 @@ class ScriptedEnv(NCSEnv):
         self.np_random, self._task_random, self._now.violations = ScriptedGenerator(), ScriptedGenerator(), 0.0
         info = self._info(no_inputs(self.plant.m), arrived=False)
         if self.guard is not None:
-            self.guard.begin(self._now.beginning(self._belief))
+            self.guard.begin(self._belief, *self._now.beginning())
             info |= self.guard.info()
         return self._observation(), info
 

@@ -166,15 +166,15 @@ class SeenEnv(NCSEnv):
 
     def install(self, guard) -> None:
         super().install(guard)
-        decide = guard.input
+        decide = guard.decide
 
         def overheard(u):
-            applied = decide(u)
+            decision = decide(u)
             if (adversary := self.disturbance.adversary) is not None and guard.filter.mode == "lookahead":
-                adversary.plan = guard.plan()
-            return applied
+                adversary.plan = guard.stored.copy()
+            return decision
 
-        guard.input = overheard
+        guard.decide = overheard
 
 
 def starts_of(case: Case, mode: str, rng: np.random.Generator, count: int) -> np.ndarray:

@@ -34,6 +34,7 @@ from tests.product import (
     safe_loop,
     safety_filter,
     safety_shield,
+    staying,
     vector_env,
     vector_shield,
 )
@@ -184,7 +185,7 @@ def test_a_start_outside_the_box_is_not_guaranteed_although_a_plan_is_certified_
 def test_what_is_predicted_must_be_nearer_than_what_is_observed_now():
     """The present estimate, which is not seen then, may be farther out than its prediction was: rounding counts it."""
     shield = safety_filter(certificate_of(PLANT), PLANT)
-    errors = shield.errors_of(0.1 * certificate_of(PLANT).Sigma)
+    errors = staying(shield.errors_of(0.1 * certificate_of(PLANT).Sigma))
 
     def reason(distance, downlink):
         monitor = GuaranteeMonitor(shield, downlink)

@@ -8,7 +8,7 @@ import pytest
 from ncs_gym import Channel, Packet, truck_trailer
 from shields.runtime.backup_plans import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
-from shields.runtime.guard import OneGuard
+from shields.runtime.guard import Guard
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.set_test import ellipsoid_test
 from tests.certificates import certificate_of
@@ -42,7 +42,7 @@ def raising(raised, when, whole):
 
 # Where an exception may come from: the loop, what is reported of it, the guard, and the task.
 PLACES = {
-    "step": ("_now.move", "_now.report", "_guard.input", "_guard.observe", "_guard.info"),
+    "step": ("_now.move", "_now.report", "_guard.decide", "_guard.observe", "_guard.info"),
     "reset": ("_now.begin", "_now.report", "_guard.begin", "_guard.info"),
 }
 
@@ -79,7 +79,7 @@ class StopsWhoAsks:
         raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("name", ["decide", "observe", "start"])
+@pytest.mark.parametrize("name", ["decide", "observe", "begin"])
 @pytest.mark.parametrize("mode", MODES)
 def test_exception_in_a_loop_stops_it_until_the_next_start(mode, name, monkeypatch):
     loop = safe_loop(certificate_of(PLANT), PLANT, Channel(delay=1), mode)
@@ -92,9 +92,9 @@ def test_exception_in_a_loop_stops_it_until_the_next_start(mode, name, monkeypat
     if name == "observe":
         loop.decide(0.1)
 
-    call = {"decide": lambda: loop.decide(0.1), "observe": loop.receive, "start": lambda: loop.start(np.zeros(2))}[name]
+    call = {"decide": lambda: loop.decide(0.1), "observe": loop.receive, "begin": lambda: loop.start(np.zeros(2))}[name]
     with monkeypatch.context() as patch:
-        patch.setattr(OneGuard, name, stopped)
+        patch.setattr(Guard, name, stopped)
         with pytest.raises(KeyboardInterrupt):
             call()
     assert (loop.guaranteed, loop.reason) == (False, NOT_STARTED)

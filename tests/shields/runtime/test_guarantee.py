@@ -12,7 +12,7 @@ from shields.runtime import Decision
 from shields.runtime import guarantee as proof
 from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor
 from tests.certificates import certificate_of
-from tests.product import belief, safe_loop, safety_filter
+from tests.product import belief, safe_loop, safety_filter, staying
 from tests.shields.attacks.cases import RANDOM, TRUCKS
 
 
@@ -70,7 +70,7 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
     shield, Sigma = safety_filter(certificate, plant), certificate.Sigma
     monitor, references = GuaranteeMonitor(shield), [Reference(shield) for _ in range(count)]
     shapes = np.array([0.2 * Sigma, Sigma, 1.1 * Sigma, -Sigma, 1e5 * np.eye(plant.n), np.full_like(Sigma, np.nan)])
-    known = shield.errors_of_many(shapes)
+    known = staying(shield.errors_of_many(shapes))
     state, states, seen = None, [None] * count, set()
     for step in range(14):
         rare = lambda share: rng.random(count) < share  # noqa: E731
@@ -96,7 +96,7 @@ def test_proofs_break_and_recover_as_the_reference_says_whatever_is_reported(nam
         reasons = [EXPLANATIONS[code] for code in monitor.reasons(state)]
         for e, reference in enumerate(references):
             observed = estimates[e], shapes[drawn[e]], bool(alarm[e])
-            alone = belief(estimates[e], bool(alarm[e])), shield.errors_of(shapes[drawn[e]])
+            alone = belief(estimates[e], bool(alarm[e])), staying(shield.errors_of(shapes[drawn[e]]))
             if begins[e]:
                 reference.start(bool(inside[e]), *observed)
                 states[e] = monitor.start(bool(inside[e]), *alone)

@@ -20,7 +20,17 @@ from shields.runtime.guarantee import GuaranteeMonitor
 from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
 from tests.plants import swinging
-from tests.product import altered, belief, loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield
+from tests.product import (
+    altered,
+    belief,
+    loop_env,
+    safe_loop,
+    safety_filter,
+    safety_shield,
+    staying,
+    vector_env,
+    vector_shield,
+)
 
 KEEPING = ("project", "switch", "boundary", "lookahead")
 STEPS = 8
@@ -200,7 +210,7 @@ def test_flags_are_those_of_the_table_for_every_sequence_of_proofs(points, c):
     def seen(proof: np.ndarray) -> tuple[Any, Any]:
         estimates = np.where(proof == ESTIMATE, 0.0, np.array([[0.95], [7.5]]))
         errors = shield.errors_of_many(plant.initial_error.shape_matrix[None]).of(np.zeros(len(proof), np.intp))
-        return belief(estimates, np.zeros(len(proof), np.bool_)), errors
+        return belief(estimates, np.zeros(len(proof), np.bool_)), staying(errors)
 
     def inputs(proof: np.ndarray) -> Decision:
         passed = proof == DECISION

@@ -4,7 +4,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from shields.runtime.safety_filter import MARGIN, MODES, REASONS, NumberedErrors
+from shields.runtime.guard import NumberedErrors
+from shields.runtime.safety_filter import MARGIN, MODES, REASONS
 from tests.certificates import certificate_of
 from tests.plants import random_plant
 from tests.product import altered, safety_filter
@@ -314,12 +315,17 @@ def test_numbers_of_error_shapes_count_within_their_table(certificate, loaded):
     shield, sizes = safety_filter(certificate, loaded), np.array([0.1, 0.5, 0.3])
     known, shapes = NumberedErrors(shield), sizes[:, None, None] * certificate.Sigma
     for each in (shapes, shapes[::-1], shapes[1:], shapes):
-        table = SimpleNamespace(shapes=each[:2], shape=each.__getitem__)
+        stay = np.array([False, True, False])[: len(each)]
+        table = SimpleNamespace(shapes=each[:2], shape=each.__getitem__, certified=stay, is_certified=stay.item)
         for growing in (each[:2], each):
             table.shapes = growing
             numbers = np.arange(len(growing))[::-1]
-            assert all(known.of(table, k) is shield.errors_of(growing[k]) for k in numbers.tolist())
-            np.testing.assert_array_equal(known.of(table, numbers).radius, shield.errors_of_many(growing[::-1]).radius)
+            for k in numbers.tolist():
+                assert known.of(table, k).radius == shield.errors_of(growing[k]).radius
+                assert known.of(table, k).stays == stay[k]
+            found = known.of(table, numbers)
+            np.testing.assert_array_equal(found.radius, shield.errors_of_many(growing[::-1]).radius)
+            np.testing.assert_array_equal(found.stays, stay[numbers])
 
 
 def test_indefinite_error_shapes_of_three_states_are_unusable():

@@ -191,12 +191,12 @@ def test_an_input_that_is_decided_and_not_applied_ends_the_claim(made, mode):
     shield = made(mode=mode, on_unproved="ignore")
     env, action = shield.unwrapped, np.zeros(shield.action_space.shape)
     shield.reset(seed=0)
-    env.guard.input(np.zeros(np.shape(env.belief.applied)))
+    env.guard.decide(np.zeros(np.shape(env.belief.applied)))
     for _ in range(2):
         assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_STEPS)
     assert np.all(shield.reset()[1]["shield_guaranteed"])
     assert np.all(shield.step(action)[-1]["shield_guaranteed"])
-    u = env.guard.input(np.zeros(np.shape(env.belief.applied)))
+    u = env.guard.decide(np.zeros(np.shape(env.belief.applied))).input
     env._now.move(env.np_random, u)
     assert np.all(shield.step(action)[-1]["shield_reason"] == OTHER_STEPS)
 
@@ -206,7 +206,7 @@ def test_an_input_without_its_step_ends_the_claim_also_where_others_begin(moves)
     shield = vector(on_unproved="ignore")
     env = shield.unwrapped
     shield.reset(seed=0)
-    u = env.guard.input(np.zeros((1, 2)))
+    u = env.guard.decide(np.zeros((1, 2))).input
     if moves:
         env._now.move(env.np_random, u)
     info = shield.reset(options={"reset_mask": np.array([True, False])})[1]
