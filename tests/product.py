@@ -18,7 +18,7 @@ import numpy as np
 import ncs_gym
 import shields
 from ncs_gym import Ball, Bounds, Box, Ellipsoid, Gaussian, Limits, LinearPlant, Model, Sum, Through
-from ncs_gym.envs.report import Belief
+from ncs_gym.envs.belief import Belief
 from ncs_gym.uncertainty.ellipsoid import UncertainSet
 from ncs_gym.validation import as_setting
 from shields import Certificate

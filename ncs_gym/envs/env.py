@@ -16,7 +16,6 @@ from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
 from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.network.downlink import no_inputs
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Annotation, Renderer, sent_at
@@ -235,7 +234,8 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         now.begin(self.np_random, start, fixed)
         self._begin_draws_of_task(seed)
         self._task_state = self._task.begin(self._task_random, self.plant)
-        info, guard = self._info(no_inputs(self.plant.m), False), self._guard
+        guard = self._guard
+        self._belief, info = now.report()
         if guard is not None:
             guard.begin(self._belief, *now.beginning())
             info |= guard.info()
@@ -264,10 +264,11 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         guard, u = self._guard, read[1]
         if guard is not None and (decided := guard.decide(u)).intervened:
             u = decided.input
-        inputs, arrived = now.move(self.np_random, u)
-        self._task_state = self._task.advance(self._task_random, self.plant, self._task_state, inputs.applied)
-        reward = self._task.reward_one(self.plant, self._task_state, now.state, inputs.applied)
-        info = self._info(inputs, arrived, read=read)
+        now.move(self.np_random, u)
+        applied = now.inputs.applied
+        self._task_state = self._task.advance(self._task_random, self.plant, self._task_state, applied)
+        reward = self._task.reward_one(self.plant, self._task_state, now.state, applied)
+        self._belief, info = now.report(read)
         if guard is not None:
             guard.observe(self._belief)
             info |= guard.info()

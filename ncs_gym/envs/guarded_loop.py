@@ -6,14 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from ncs_gym.envs.belief import Belief
 from ncs_gym.envs.episode_channels import EpisodeChannels
-from ncs_gym.envs.info import actions_of, loop_info
 from ncs_gym.envs.loop import Loop, LoopState
-from ncs_gym.envs.report import Belief
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.network.channel import Channel, require_on_request
 from ncs_gym.network.contract import ChannelContract, largest_age
-from ncs_gym.network.downlink import DownlinkProtocol, Inputs
+from ncs_gym.network.downlink import DownlinkProtocol
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
 from ncs_gym.uncertainty.disturbances import Disturbance
@@ -117,9 +116,3 @@ class GuardedLoop:
         """Gives the task a generator of its own, so that what it draws changes nothing in the loop."""
         if seed is not None or self._task_random is None:
             self._task_random = self.np_random.spawn(1)[0]
-
-    def _info(self, inputs: Inputs, arrived: Any, counted: Any = None, read: Any = None) -> dict[str, Any]:
-        """Returns `info`, and keeps the belief; see `LoopState.report` and `actions_of`."""
-        report = self._now.report(inputs, arrived, counted)
-        self._belief = report.belief
-        return loop_info(report, self.loop, actions_of(inputs, self.plant, read))

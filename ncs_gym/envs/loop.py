@@ -9,16 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from ncs_gym.envs.belief import Belief
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.loop_settings import expect, loop_contracts, starting_set
-from ncs_gym.envs.report import Belief, Report
+from ncs_gym.envs.spaces import nearest_action
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.vector_estimator import VectorEstimator
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, largest_age
-from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, VectorDownlinkState
+from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, VectorDownlinkState, no_inputs
 from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
 from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.network.requests import Requests
@@ -31,6 +32,11 @@ from ncs_gym.validation import CopiedWhole, as_flag, frozen, warn_caller
 
 # Keeps the rounding of a sampled start inside the initial set.
 SAMPLE_ROUNDING = 1e-9
+# What is a number in the info of one environment, and of many an array that the environments go on using.
+_SHARED = (
+    *("measurement_age", "assumption_violated", "packets", "episode_steps", "episode_violations", "packet_arrived"),
+    *("downlink_broken", "requested", "request_forced"),
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -124,6 +130,7 @@ class LoopState(CopiedWhole, ABC):
     Attributes:
         state: x, shape (n,) or (n, N).
         worst: `worst_constraint_values` of the last step, shape (k + q,) or (k + q, N).
+        inputs, arrived: Those of the last step, and whether a packet arrived then, a bool or shape (N,).
         steps, episodes: Steps taken in the episode, and episodes begun, ints or shape (N,).
         moves: Steps and resets since the loop was made, an int or shape (N,).
         start: What the start of the episode is known to lie in, for one loop; for N, states that episodes were started
@@ -144,6 +151,8 @@ class LoopState(CopiedWhole, ABC):
         if loop.channel.on_request:
             self.requests = Requests(loop.channel, loop.contract, loop.protocol.input_delay, size)
         self._others: dict[str, Any] = {}
+        self._no_inputs = self.inputs = no_inputs(plant.m, size)
+        self.arrived: Any = self._no_inputs.missing
 
     def read(self, options: dict[str, Any] | None) -> tuple[list[Any], np.ndarray | None]:
         """Returns what options of `reset` say of channels and of parameters; raises ValueError if one is wrong."""
@@ -164,13 +173,10 @@ class LoopState(CopiedWhole, ABC):
         many = self._size is not None
         return self.channels.infos("channel", many=many) | self.downlinks.infos("downlink", many=many)
 
-    def move(self, rng: np.random.Generator, u: np.ndarray) -> tuple[Inputs, Any]:
-        """Moves one step on; returns the inputs of the step, and whether a packet arrived, a bool or shape (N,).
-
-        What is decided now is `u`, shape (m,) or (m, N) [physical units].
-        """
+    def move(self, rng: np.random.Generator, u: np.ndarray) -> None:
+        """Moves one step on; what is decided now is `u`, shape (m,) or (m, N) [physical units]."""
         self.moves = self.moves + 1
-        inputs = self.downlink.exchange(rng, self.steps, u)
+        self.inputs = inputs = self.downlink.exchange(rng, self.steps, u)
         before, requested = self.state, None
         if self.requests is not None:
             self.requests.decide(self.estimator.age)
@@ -180,17 +186,26 @@ class LoopState(CopiedWhole, ABC):
         self.state.flags.writeable = False  # tasks, which read it, are code of others
         self.worst = self.loop.plant.worst_constraint_values(before, inputs.applied, self.state)
         self.steps = self.steps + 1
-        return inputs, self._receive(rng, inputs.applied, requested)
+        self.arrived = self._receive(rng, inputs.applied, requested)
 
-    def report(self, inputs: Inputs, arrived: Any, counted: np.ndarray | None = None) -> Report:
-        """Returns what happened; the costs of loops that are not `counted`, shape (N,), do not count once more."""
-        plant, estimator, worst = self.loop.plant, self.estimator, self.worst
-        values = plant.constraint_values(self.state) if self.loop.limits_the_way else worst
+    def report(
+        self, read: tuple[np.ndarray, np.ndarray] | None = None, counted: Any = 1.0
+    ) -> tuple[Belief, dict[str, Any]]:
+        """Returns what a controller can know, and `info`, which says what is true besides.
+
+        Every array is a fresh copy that nobody writes into, or that is the caller's; the loop is the last axis of the
+        former and the first one of what `info` holds for many. Keys of a feature are there where the loop has it.
+
+        Args:
+            read: What `read_action` returned of the action that asked for the inputs.
+            counted: A mask, shape (N,): the costs of other loops do not count once more.
+        """
+        loop, plant, estimator, worst = self.loop, self.loop.plant, self.estimator, self.worst
+        state, (applied, committed, missing), table = self.state, self.inputs, estimator.histories.table
+        values = plant.constraint_values(state) if loop.limits_the_way else worst
         estimate, number = estimator.numbered(self.downlink.committed.pending)
         age, damaged, outside = estimator.age, estimator.damaged, self.process.alarm
-        alarm, asked, forced = estimator.alarm | outside, False, False
-        if self.requests is not None:
-            asked, forced = self.requests.requested, self.requests.forced
+        alarm = estimator.alarm | outside
         if self._size is None:
             cost, alarm = 1.0 if max(worst.tolist()) > 0.0 else 0.0, bool(alarm)
         else:
@@ -199,17 +214,42 @@ class LoopState(CopiedWhole, ABC):
             age, damaged, outside = (frozen(each.copy()) for each in (age, damaged, outside))
             for array in (estimate, number, alarm, self.moves):
                 frozen(array)
-            if self.requests is None:
-                asked = forced = self.nothing
-        self.violations = self.violations + (cost if counted is None else cost * counted)
-        (applied, committed, missing), table = inputs, estimator.histories.table
+        self.violations = self.violations + cost * counted
         belief = Belief(estimate, number, table, age, alarm, damaged, outside, applied, committed, self.moves)
-        happened = belief, self.steps, self.state, estimator.mean, arrived, self.packets
-        kept = values, worst, cost, self.violations
-        others, parameters = self._others, self.process.process.parameters
-        if parameters is not None:
-            others = others | {"parameters": parameters}
-        return Report(*happened, *kept, missing, asked, forced, others)
+        actions = _actions_of(self.inputs, plant, read)
+        info = {
+            "state": state.copy().T,
+            "estimate": estimate.copy().T,
+            "estimation_error": (estimator.mean - state).T,
+            "error_shape": belief.error_shape.copy(),
+            "input": applied.copy().T,
+            "action_applied": actions[0],
+            "action_committed": actions[1],
+            "constraint_values": values.T,
+            "cost": cost,
+            "episode_steps": self.steps,
+            "measurement_age": age,
+            "packet_arrived": self.arrived,
+            "assumption_violated": alarm,
+            "episode_violations": self.violations,
+            "is_success": (self.violations == 0.0) * 1.0,
+            "contract_broken": age > loop.oldest,
+            "packets": self.packets,
+            **self._others,
+        }
+        if (parameters := self.process.process.parameters) is not None:
+            info["parameters"] = parameters
+        if loop.limits_the_way:
+            info["worst_constraint_values"] = worst.copy().T
+        if loop.downlink is not None:
+            info["input_committed"], info["downlink_broken"] = committed.copy().T, missing
+        if self.requests is not None:
+            info["requested"], info["request_forced"] = self.requests.requested, self.requests.forced
+        if self._size is not None:
+            for key in (*_SHARED, *self._others):
+                if key in info:
+                    info[key] = info[key].copy()
+        return belief, info
 
     @property
     def pending(self) -> tuple[np.ndarray, ...]:
@@ -229,7 +269,6 @@ class LoopState(CopiedWhole, ABC):
         return starts, earlier, self.channels.now
 
     # Of one loop or of many: those of the classes below.
-    nothing: Any = False
     state: np.ndarray
     worst: np.ndarray
     memory: Any
@@ -262,6 +301,7 @@ class OneLoop(LoopState):
     def begin(self, rng: np.random.Generator, start: np.ndarray | None, fixed: np.ndarray | None) -> None:
         """Begins an episode at a state, (n,), or a drawn one; `fixed` is what `read` returned of parameters."""
         loop, self.moves = self.loop, self.moves + 1
+        self.inputs, self.arrived = self._no_inputs, self._no_inputs.missing
         initial = loop.initial_set if start is None else None
         first = (1.0 - SAMPLE_ROUNDING) * loop.initial_set.sample(rng) if start is None else start
         self.state, self.start = self.process.start(rng, first, initial, fixed)
@@ -301,7 +341,6 @@ class ManyLoops(LoopState):
         plant, self.size = loop.plant, size
         self.estimator = VectorEstimator(plant, loop.histories(loop.channel), size)
         self.downlink = VectorDownlinkState(loop.protocol, plant.m, size)
-        self.nothing = np.zeros(size, np.bool_)
         self.packets, self.violations = np.zeros(size, np.int64), np.zeros(size)
         self.steps, self.episodes, self.moves = np.zeros((3, size), np.int64)
         self.state, self.start = np.zeros((plant.n, size)), np.full((size, plant.n), np.nan)
@@ -312,6 +351,7 @@ class ManyLoops(LoopState):
     ) -> None:
         """Begins episodes where a mask, (N,), says so, at states, (N, n), or drawn ones; for `fixed` see `read`."""
         loop, rows, self.moves = self.loop, np.flatnonzero(mask), self.moves + mask
+        self.inputs, self.arrived = self._no_inputs, self._no_inputs.missing
         count = len(rows)
         first_states = ((1.0 - SAMPLE_ROUNDING) * loop.initial_set.sample(rng, count)).T
         first_errors = self.process.first_error(rng, count)
@@ -374,3 +414,18 @@ def with_columns(values: np.ndarray, mask: np.ndarray, new: Any) -> np.ndarray:
     found = values.astype(np.result_type(values, new))
     found[..., mask] = new
     return found
+
+
+def _actions_of(
+    inputs: Inputs, plant: LinearPlant, read: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the float32 actions that stand for the inputs applied and committed, shape (m,) or (N, m) each.
+
+    If what `read_action` returned was decided, the action is the one that was given.
+    """
+    if read is not None and inputs.committed is inputs.applied is read[1] and read[0].dtype.char == "f":
+        return read[0], read[0].copy()
+    applied = nearest_action(inputs.applied.T, plant)
+    if inputs.committed is inputs.applied:  # as without a downlink
+        return applied, applied.copy()
+    return applied, nearest_action(inputs.committed.T, plant)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.envs.report import Belief
+from ncs_gym.envs.belief import Belief
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks.base_task import Task

@@ -17,7 +17,6 @@ from ncs_gym.envs.loop import ManyLoops, with_columns
 from ncs_gym.envs.loop_settings import vector_reset_options
 from ncs_gym.envs.spaces import Observer, read_actions
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.downlink import no_inputs
 from ncs_gym.tasks.base_task import Task
 from ncs_gym.validation import as_count, setting
 
@@ -162,11 +161,11 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         """Returns what a step returns in which no episode begins, given the inputs proposed, shape (m, N)."""
         now, guard = self._now, self._guard
         u = u if guard is None else guard.decide(u).input
-        inputs, arrived = now.move(self.np_random, u)
-        applied = inputs.applied
+        now.move(self.np_random, u)
+        applied = now.inputs.applied
         self._task_state = self._task.advance_many(self._task_random, self.plant, self._task_state, applied)
         reward = self._task.reward_many(self.plant, self._task_state, now.state, applied)
-        info = self._info(inputs, arrived)
+        self._belief, info = now.report()
         if guard is not None:
             guard.observe(self._belief)
             info |= guard.info()
@@ -187,7 +186,7 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         now.begin(self.np_random, mask, starts, fixed)
         begun = self._task.begin_many(self._task_random, self.plant, int(np.count_nonzero(mask)))
         self._task_state = np.array(begun) if mask.all() else with_columns(self._task_state, mask, begun)
-        info = self._info(no_inputs(self.plant.m, self.num_envs), np.zeros(self.num_envs, np.bool_), mask)
+        self._belief, info = now.report(counted=mask)
         if self._guard is not None:
             self._guard.begin(self._belief, *now.beginning(np.flatnonzero(mask)), mask)
             info |= self._guard.info()

@@ -1,7 +1,7 @@
 """The shield at run time: which inputs keep the next state safe, what is applied instead, and what is proved.
 
-`safety_filter` decides (`set_test`, `projection`, `backup_plans`), `guarantee` follows whether the proof of safety
-holds, and `guard` is both for one loop, or for N, the last axis of all arrays; `safe_loop` puts it into a real loop,
+`safety_filter` decides (`set_test`, `projection`, `backup_plans`), `guard` has it decide and follows whether the proof
+of safety holds, for one loop, or for N, the last axis of all arrays; `safe_loop` puts it into a real loop,
 `wrapper` into environments.
 """
 

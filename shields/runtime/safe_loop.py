@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, Packet
-from ncs_gym.envs.report import Belief
+from ncs_gym.envs.belief import Belief
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.network.actuator import AppliedInputs, Command, CommittedInputs, Echo, as_echo

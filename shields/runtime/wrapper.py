@@ -71,9 +71,9 @@ class _Shield(RecordConstructorArgs):
             )
         certificate = certificate_for(inner.plant, inner.certificate_contract) if read is None else read
         judge = SafetyFilter(certificate, inner.plant, mode, horizon)
-        size = None if isinstance(inner, NCSEnv) else inner.num_envs
-        self._guard = Guard(judge, inner.downlink_protocol, on_unproved, size)
-        self._guard.look_at([inner.channel] if size is None else inner.episode_channels)
+        one = isinstance(inner, NCSEnv)
+        self._guard = Guard(judge, inner.downlink_protocol, on_unproved, None if one else inner.num_envs)
+        self._guard.look_at([inner.channel] if one else inner.episode_channels)
         self.penalty = penalty
         if (promised := certificate.contract) is not None and inner.certificate_contract is None:
             warn_caller(

@@ -10,7 +10,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
-from ncs_gym.network.downlink import no_inputs
 from ncs_gym.network.packet_loss_and_delay import ChannelState, LossState
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.processes.plant_step import PlantSimulation
@@ -103,7 +102,7 @@ class ScriptedEnv(NCSEnv):
             states = many._now.downlink._channel_state._loss_state
             self._now.downlink.in_flight._loss_state = LossState(*(kept[index] for kept in states))
         self.np_random, self._task_random, self._now.violations = ScriptedGenerator(), ScriptedGenerator(), 0.0
-        info = self._info(no_inputs(self.plant.m), arrived=False)
+        self._belief, info = self._now.report()
         if self.guard is not None:
             self.guard.begin(self._belief, *self._now.beginning())
             info |= self.guard.info()

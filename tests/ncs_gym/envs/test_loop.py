@@ -6,16 +6,16 @@ import pytest
 from ncs_gym.envs.loop import ManyLoops, OneLoop
 from tests.product import gym_env, gym_vector_env, safety_shield, vector_shield
 
-TRUTH = ("state", "mean", "values", "worst")
+TRUTH = ("state", "estimation_error", "constraint_values")
 IDS = ("CartPoleTwoWay", "Convoy")
 
 
 def without_truth(report):
     """A method that reports the same, but for what is true of the loop."""
 
-    def unknowing(self, *arguments):
-        told = report(self, *arguments)
-        return told._replace(**{name: np.full_like(getattr(told, name), np.nan) for name in TRUTH})
+    def unknowing(self, *arguments, **named):
+        belief, info = report(self, *arguments, **named)
+        return belief, info | {name: np.full_like(info[name], np.nan) for name in TRUTH}
 
     return unknowing
 

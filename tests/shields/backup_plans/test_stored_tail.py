@@ -121,9 +121,9 @@ class Doubtful:
         self.active, self._report = False, env._now.report
         env._now.report = self
 
-    def __call__(self, *given):
-        report = self._report(*given)
-        return report._replace(belief=forged(report.belief)) if self.active else report
+    def __call__(self, *given, **named):
+        belief, info = self._report(*given, **named)
+        return (forged(belief) if self.active else belief), info
 
 
 def start_with_a_tail(reset, plant, safe, least):

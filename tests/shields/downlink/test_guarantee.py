@@ -14,8 +14,8 @@ from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
     OLD_SAMPLE,
     OTHER_INPUT,
-    GuaranteeMonitor,
 )
+from shields.runtime.guard import GuaranteeMonitor
 from shields.runtime.starts import starts_known
 from shields.verification.rational_matrix import (
     congruence,
@@ -215,10 +215,10 @@ class Meddler:
         self.key, self.active, self._report = key, False, env._now.report
         env._now.report = self
 
-    def __call__(self, *given):
-        report = self._report(*given)
-        said = getattr(report.belief, self.key) + 1e-12 * np.asarray(self.active)
-        return report._replace(belief=report.belief._replace(**{self.key: said}))
+    def __call__(self, *given, **named):
+        belief, info = self._report(*given, **named)
+        said = getattr(belief, self.key) + 1e-12 * np.asarray(self.active)
+        return belief._replace(**{self.key: said}), info
 
 
 @pytest.mark.parametrize(("key", "reason"), [("committed", OTHER_INPUT), ("applied", LATE_INPUT)])

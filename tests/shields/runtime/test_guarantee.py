@@ -10,7 +10,8 @@ from ncs_gym.uncertainty.shape_matrices import is_inside
 from shields import SafetyFilter, certificate_for
 from shields.runtime import Decision
 from shields.runtime import guarantee as proof
-from shields.runtime.guarantee import EXPLANATIONS, GuaranteeMonitor
+from shields.runtime.guarantee import EXPLANATIONS
+from shields.runtime.guard import GuaranteeMonitor
 from tests.certificates import certificate_of
 from tests.product import belief, safe_loop, safety_filter, staying
 from tests.shields.attacks.cases import RANDOM, TRUCKS

@@ -7,7 +7,8 @@ import pytest
 from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess
 from ncs_gym.uncertainty.remainder import Remainder
 from shields import Infeasible
-from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE, GuaranteeMonitor
+from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE
+from shields.runtime.guard import GuaranteeMonitor
 from tests.certificates import certificate_of
 from tests.plants import with_remainder
 from tests.product import (

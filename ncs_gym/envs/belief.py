@@ -1,4 +1,4 @@
-"""What is told of a control loop, or of N: what a controller can know, and what happened."""
+"""What a controller can know of a loop, or of N."""
 
 from __future__ import annotations
 
@@ -61,39 +61,3 @@ class Belief(NamedTuple):
 
 def _loaded_belief(*values: Any) -> Belief:
     return Belief._make(frozen(each) if isinstance(each, np.ndarray) else each for each in values)
-
-
-class Report(NamedTuple):
-    """What happened in a step of a loop; of N loops, arrays whose last axis is the loop.
-
-    Attributes:
-        belief: What a controller can know; the rest is true besides.
-        steps: Steps taken in the episode, an int or shape (N,).
-        state: x, shape (n,) or (n, N).
-        mean: x_hat now, also behind a downlink, of the same shape.
-        arrived: Whether a packet arrived at this step, a bool or shape (N,).
-        packets: Samples sent in the episode, an int or shape (N,).
-        values: How far c_j x is beyond a limit now, shape (k,) or (k, N).
-        worst: The largest since the last step, and those of limits of x and u, shape (k + q,) or (k + q, N).
-        cost: 1.0 if one of these is positive, else 0.0, a float or shape (N,).
-        violations: The sum of costs in the episode, likewise.
-        missing: Whether zero was applied because the input committed had not arrived, a bool or shape (N,).
-        requested: Whether a sample was requested, likewise.
-        forced: Whether that was so only because the contract needs it, likewise.
-        others: Infos about the episode: its channels, the parameters of the member of a family.
-    """
-
-    belief: Belief
-    steps: Any
-    state: np.ndarray
-    mean: np.ndarray
-    arrived: Any
-    packets: Any
-    values: np.ndarray
-    worst: np.ndarray
-    cost: Any
-    violations: Any
-    missing: Any
-    requested: Any
-    forced: Any
-    others: dict[str, Any]
