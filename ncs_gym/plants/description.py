@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from textwrap import fill
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ncs_gym.plants.between_samples import BetweenSamples
 from ncs_gym.validation import counted
+
+if TYPE_CHECKING:
+    from ncs_gym.plants.linear_plant import LinearPlant
 
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
@@ -20,7 +23,7 @@ _WITHOUT = ("no disturbance acts on the plant", "the sensors measure without noi
 _NOISES = ("disturbances", "sensor noise", "the first error")
 
 
-def described(plant: BetweenSamples) -> str:
+def described(plant: LinearPlant) -> str:
     """Returns limits, bounds and assumptions for people, with units."""
     sizes = ", ".join(counted(*each) for each in ((plant.n, "state"), (plant.m, "input"), (plant.p, "output")))
     radius = f"spectral radius {plant.spectral_radius:.6g}"
@@ -58,7 +61,7 @@ def described(plant: BetweenSamples) -> str:
     return "\n".join(shown_lines).replace(_UNBROKEN, " ")
 
 
-def assumptions_of(plant: BetweenSamples) -> tuple[str, ...]:
+def assumptions_of(plant: LinearPlant) -> tuple[str, ...]:
     """What a certificate takes for granted beyond numbers, in sentences."""
     held = plant.nominal_disturbance, plant.nominal_sensor_error, plant.nominal_initial_error
     without = zip(_WITHOUT, held, strict=True)
@@ -74,7 +77,7 @@ def assumptions_of(plant: BetweenSamples) -> tuple[str, ...]:
     return tuple(assumed)
 
 
-def row_limit(plant: BetweenSamples, j: int) -> str:
+def row_limit(plant: LinearPlant, j: int) -> str:
     """Returns what limit j of the safe box, the inputs and both together says; that of a sum in its largest entry."""
     n, m = plant.n, plant.m
     rows = [np.pad(plant.box, ((0, 0), (m, 0))), np.eye(m, m + n), np.roll(plant.mixed_rows, m, axis=1)]

@@ -9,21 +9,20 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.bounds import DELTA, Bounds, Sum
-from ncs_gym.limits import Limits, LimitValues
+from ncs_gym.limits import Limits, LimitValues, weight_of
 from ncs_gym.model import Model
-from ncs_gym.plants.between_samples import BetweenSamples
 from ncs_gym.plants.description import assumptions_of, described
-from ncs_gym.plants.hard_bounds import Source, weight_of
-from ncs_gym.plants.past_inputs import with_past_inputs
-from ncs_gym.plants.resting_point import at_rest, with_residual
+from ncs_gym.plants.hard_bounds import HardBounds, Source
 from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, read_back
-from ncs_gym.validation import as_names, counted, read_only, reason_of, shown
+from ncs_gym.uncertainty.shape_matrices import outer_sum
+from ncs_gym.validation import as_names, counted, read_only, reason_of, setting, shown
 
 # An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
 FARTHEST = 1e30
@@ -34,15 +33,35 @@ _NUMBERS = (
 )
 _FORMAT = "ncs-gym plant 2"
 _VALUES: dict[str, type] = {"model": Model, "limits": Limits, "bounds": Bounds}
+# What the bound between grid points gains for the rounding of rows, relative to itself and to what a row reaches.
+GRID_MARGIN, GRID_ROUNDING = 0.01, 1e-12
+
+
+class GridRows(NamedTuple):
+    """The rows c of the safe box as rows on x and u at the times tau_i = i dt / N of a step, i = 0..N-1.
+
+    With the input held, x(tau) = A_tau x + B_tau u + d_tau, where [A_tau, B_tau] is the upper part of exp(G tau) for
+    G = [[Ac, Bc], [0, 0]] (docs/shield_proof.md, "Between the samples").
+
+    Attributes:
+        state: c A_tau, shape (N, k, n).
+        input: c B_tau, shape (N, k, m).
+        remainder: eta, shape (k,): for x in the box and u within its limits, c (A_tau x + B_tau u) is nowhere beyond
+            its values at the two grid points around tau by more than this, the rounding of the rows included.
+    """
+
+    state: np.ndarray
+    input: np.ndarray
+    remainder: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearPlant(BetweenSamples):
+class LinearPlant(HardBounds):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
 
     States and inputs are deviations from an operating point: that of the model, which the middle of a disturbance moves
     to where it rests. Past inputs are the last states if inputs take effect late or their change is limited. What
-    follows is listed by `LimitValues`, `HardBounds` and `BetweenSamples`. `dataclasses.replace` makes another plant.
+    follows is listed by `LimitValues` and `HardBounds`. `dataclasses.replace` makes another plant.
 
     Attributes:
         model: The equations.
@@ -50,6 +69,8 @@ class LinearPlant(BetweenSamples):
         bounds: Each a sum of sets.
         labels: Names of states and inputs with their units, {"states": {"angle": "rad"}, "inputs": {"voltage": "V"}}.
         region: Digest of the model and the limits, which a remainder belongs to.
+        state_names, state_units, input_names, input_units: The labels, with defaults.
+        dt, continuous_model, between_samples: Those of the model and the limits.
 
     Raises:
         ValueError: If the values do not fit each other.
@@ -60,6 +81,13 @@ class LinearPlant(BetweenSamples):
     bounds: Bounds
     labels: Mapping[str, Any] | None = None
     region: str = field(init=False)
+    state_names: tuple[str, ...] = field(init=False)
+    state_units: tuple[str, ...] = field(init=False)
+    input_names: tuple[str, ...] = field(init=False)
+    input_units: tuple[str, ...] = field(init=False)
+    dt = setting("dt", "model.dt")
+    continuous_model = setting("continuous_model", "model.continuous")
+    between_samples = setting("between_samples", "limits.between_samples")
 
     def __post_init__(self) -> None:
         for name, kind in _VALUES.items():
@@ -68,12 +96,12 @@ class LinearPlant(BetweenSamples):
         model, n = self.model, len(self.model.A)
         sums = self.bounds.sums(n, len(model.H))
         declared = sums[0].declared
-        rest = at_rest(self.limits.around(model), declared.sized(n))
+        rest = self.limits.around(model).at_rest(declared.sized(n))
         region = model.A, model.B, model.dt, rest.box, *rest.box_ends, rest.input_ends
         region += rest.mixed_rows, *rest.mixed_ends
         self._set(bounds=Bounds(*sums), remainder=None, region=_digest(enumerate(region)))
-        whole = with_past_inputs(rest, model.delays, self.limits.change_within(rest.input_half))
-        self._set(**whole.values, n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
+        whole = rest.with_past_inputs(model.delays, self.limits.change_within(rest.input_half))
+        self._set(**vars(whole), n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
         self._declare([declared, *sums[1:]], rest)
         self._name()
         self._check_between_samples()
@@ -82,12 +110,13 @@ class LinearPlant(BetweenSamples):
             self._set(remainder=owned[0], bounds=replace(self.bounds, disturbance=disturbance))
 
     def _declare(self, sums: list[Sum], rest: LimitValues) -> None:
-        n, rows = len(rest.A), rest.box
-        weight, past = weight_of(rows, np.zeros(n)), self.past
+        n, past = len(rest.A), self.past
+        weight = weight_of(rest.box, np.zeros(n))
         disturbance = Source.of(sums[0], weight, past, keeps_ball=True)
-        if rest.lacking.any():
+        if rest.lacking.any():  # twice that is held, in units of the rows
             shape = np.zeros((n, n)) if disturbance.bound is None else disturbance.bound.shape_matrix[:n, :n]
-            held = with_residual(Ellipsoid(shape), rest.lacking, rows).shape_matrix
+            gram, lacking = exact.product(rest.box.T, rest.box), np.diag(n * np.square(2.0 * rest.lacking))
+            held = outer_sum(shape, lacking, gram + np.eye(n) * np.trace(gram) / n)
             disturbance = disturbance._replace(bound=Ellipsoid(np.pad(held, (0, past))))
         sensor, first = Source.of(sums[1], np.eye(self.p)), Source.of(sums[2], weight, past)
         self._set(of_disturbance=disturbance, of_sensor=sensor, of_first_error=first)
@@ -109,6 +138,17 @@ class LinearPlant(BetweenSamples):
         past = tuple(f"{name} of {age} ago" for age in ages for name in self.input_names)
         self._set(state_names=self.state_names + past, state_units=self.state_units + self.input_units * len(ages))
         self._set(labels={name: dict(labels[name]) for name in labels} or None)
+
+    def _check_between_samples(self) -> None:
+        """Raises ValueError if times between samples count of which nothing is known."""
+        if self.between_samples is None:
+            return
+        has_remainder = any(each.is_left_out for each in self.bounds.disturbance.parts)
+        if self.continuous_model is None or self.past or has_remainder or self.step_offset.any():
+            needed = "a model of Model.sampled, without delays, rates, remainder and constant disturbance"
+            raise ValueError(f"between_samples needs {needed}: else nothing is known of times within a step")
+        if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
+            raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")
 
     @property
     def document(self) -> dict[str, Any]:
@@ -154,11 +194,9 @@ class LinearPlant(BetweenSamples):
         counts = ((self.n, "state"), (self.m, "input"), (self.p, "output"))
         return f"<LinearPlant: {', '.join(counted(*each) for each in counts)}, fingerprint {self.fingerprint[:16]}>"
 
-    @cached_property
+    @property
     def without_remainder(self) -> LinearPlant:
         """The same plant without its remainder."""
-        if self.remainder is None:
-            return self
         return replace(self, bounds=replace(self.bounds, disturbance=self.bounds.disturbance.declared))
 
     @property
@@ -170,6 +208,61 @@ class LinearPlant(BetweenSamples):
     def state_limit(self) -> np.ndarray:
         """Where a simulation stops a state that runs away, shape (n,); infinite for a stable plant."""
         return read_only(FARTHEST * self.half_widths if self.spectral_radius >= 1.0 else np.full(self.n, np.inf))
+
+    @cached_property
+    def grid_rows(self) -> GridRows | None:
+        """What the box says between samples, the same on every machine; None if only the sampling instants count.
+
+        Between two grid points a function leaves its linear interpolation by at most h^2/8 times its largest second
+        derivative, here [c, 0] G^2 exp(G tau) (x, u). In the norm |q|_W = sum |q_j| W_j, with W the largest |x_j| and
+        |u_j|, that grows from one grid point to the next by at most exp(h m), m the logarithmic norm of G.
+
+        Raises:
+            OverflowError: If it is out of reach of float64.
+        """
+        model, points = self.continuous_model, self.between_samples
+        if points is None:
+            return None
+        G, h = np.concatenate([model, np.zeros((self.m, self.n + self.m))]), self.dt / points
+        rows, W = np.pad(self.box, ((0, 0), (0, self.m))), np.concatenate([self._widest(), self.largest_input])
+        try:
+            times = [self.dt * i / points for i in range(1, points)]
+            onward = [rows, *(exact.product(rows, exact.exponential(G, time)) for time in times)]
+            bends = [exact.product(np.abs(exact.product(each, G, G)), W) for each in onward]
+            sizes = [exact.product(np.abs(each), W) for each in onward]
+            growth = float(exact.exponential(np.array([[_logarithmic_norm(G, W)]]), h)[0, 0])
+        except OverflowError as error:
+            raise OverflowError(
+                "the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
+            ) from error
+        remainder = (1.0 + GRID_MARGIN) * (h * h / 8.0) * growth * np.max(bends, axis=0)
+        remainder = remainder + GRID_ROUNDING * np.max(sizes, axis=0)
+        state, applied = np.split(np.array(onward), [self.n], axis=2)
+        return GridRows(read_only(state), read_only(applied), read_only(remainder))
+
+    @cached_property
+    def _rows_within_step(self) -> np.ndarray | None:
+        """Rows on (x, u, x+) that are c x(tau_i), i = 1..N-1, shape ((N - 1) k, 2 n + m); None as of `grid_rows`.
+
+        What a disturbance did has come in proportion to the time: d_tau = (tau / dt) (x+ - A x - B u) is in E(D), too.
+        """
+        if (rows := self.grid_rows) is None:
+            return None
+        shares = (np.arange(1, len(rows.state)) / len(rows.state))[:, None, None]
+        moved, pushed = rows.state[1:] - shares * (self.box @ self.A), rows.input[1:] - shares * (self.box @ self.B)
+        return np.concatenate([moved, pushed, shares * self.box], axis=2).reshape(-1, 2 * self.n + self.m)
+
+    def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
+        """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
+
+        Shape (k + q,) or (k + q, N), for x, x+ of shape (n,) or (n, N) and the input that was held, (m,) or (m, N).
+        """
+        values, rows = self.constraint_values(x_next), self._rows_within_step
+        if rows is not None:
+            reached = rows.dot(np.concatenate([state, u, x_next])).reshape(-1, *values.shape)
+            low, high = self.box_ends if values.ndim == 1 else self.box_ends[:, :, None]
+            values = np.maximum(np.maximum(reached.max(axis=0) - high, low - reached.min(axis=0)), values)
+        return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values
 
     @cached_property
     def fingerprint(self) -> str:
@@ -197,3 +290,12 @@ def _digest(numbers: Iterable[tuple[Any, Any]]) -> str:
         array = np.asarray(value, dtype="<f8") + 0.0
         digest.update(f"{name}{array.shape}".encode() + array.tobytes())
     return digest.hexdigest()
+
+
+def _logarithmic_norm(G: np.ndarray, W: np.ndarray) -> float:
+    """Returns m = max_i (G_ii + sum_{j != i} |G_ij| W_j / W_i), at least 0.
+
+    In the norm max |z_j| / W_j of columns, and so in |q|_W of rows, |exp(G s)| <= exp(s m).
+    """
+    off = np.abs(G) * (1.0 - np.eye(len(G)))
+    return max(float((np.diag(G) + exact.product(off, W) / W).max()), 0.0)

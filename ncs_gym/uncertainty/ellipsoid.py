@@ -63,10 +63,6 @@ class UncertainSet(ReadOnlyArrays, ABC):
         """Returns max of a'z as seen from the middle, for a direction a (n,), or for each of shape (..., n)."""
         return self.ellipsoid().support(direction)
 
-    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:
-        """Returns a point, shape (n,), or `count` of them, (count, n): uniform, or what a truncated Gaussian draws."""
-        return self.ellipsoid().sample(rng, count)
-
     def of_plant(self, plant: Any) -> Self:
         """Returns the set as a part of what this plant declares; raises ValueError if it belongs to another one."""
         return self

@@ -146,7 +146,7 @@ def held(**more):
     return sampled_plant(OSCILLATOR, dt=1.5, **PUSHED | {"box": [2.0, 3.0]} | bound | more)
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
 def test_constant_disturbance_is_refused_beside_between_samples_also_where_two_cancel_at_the_samples():
     both = {"disturbance_bound": ([[0.0, 0.0], [0.6, -0.6]], [0.0, 0.0], [1.0, 1.0])}
     cancel = {"disturbance_bound": ([[0.0], [0.6]], [-1.0], [0.0])}
