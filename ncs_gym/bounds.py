@@ -240,14 +240,3 @@ class Bounds(ReadOnlyArrays):
                 needed = f"a set in dimension {size} is needed, got one in dimension {each.size}"
                 raise ValueError(f"Bounds({name}=...): {needed}")
         return sums
-
-
-def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
-    """Returns Gaussian noise, of which 95 % count, in proportion to half-widths of a safe box, shape (n,).
-
-    Process noise is bounded by a fraction of them, sensor noise by one of what they allow outputs H x, and the first
-    error by that of the smallest one.
-    """
-    outputs, smallest = exact.product(np.abs(H), half_widths), np.full(len(half_widths), half_widths.min())
-    sizes = disturbance * half_widths, sensor * outputs, sensor * smallest
-    return Bounds(*(Gaussian(np.diag(np.square(each)) / truncation_energy(DELTA, len(each)), DELTA) for each in sizes))

@@ -14,7 +14,7 @@ from ncs_gym.estimation.error_bounds_by_age import error_sets_by_age, in_round_n
 from ncs_gym.estimation.error_sets import ErrorSet, ErrorSetError
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.uncertainty.shape_matrices import rounded_up
+from ncs_gym.uncertainty.ellipsoid import rounded_up
 
 # Growth c of the optimal set: slack in (E1), and room for updates (docs/shield_proof.md).
 GROWTH = 1.1

@@ -11,7 +11,7 @@ from ncs_gym.estimation.error_sets import ErrorSet, ErrorSetError, congruence_su
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum, rounded_up
+from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum, rounded_up
 
 # Digits of sets, relative to their extents, of gains and of rates: what differs between processors is cut off.
 DIGITS = 10

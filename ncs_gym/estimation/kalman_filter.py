@@ -11,7 +11,7 @@ from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.set_membership import SHAPE_STEP, SetMembership
 from ncs_gym.plants.hard_bounds import FLAT_INFLATION
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.uncertainty.shape_matrices import is_inside
+from ncs_gym.uncertainty.ellipsoid import is_inside
 
 # Covariances grow no further than this, in squared half-widths of the safe box.
 LARGEST_COVARIANCE = 1e12

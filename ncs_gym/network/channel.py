@@ -1,17 +1,19 @@
-"""The settings of a network between sensor and controller: loss, transmission period, quantization and delay."""
+"""The settings of a network between sensor and controller: loss, send period, quantization and delay; packets."""
 
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
 from math import isclose
+from operator import index
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym.reading import MOST_PACKETS
-from ncs_gym.validation import as_count, as_flag, as_number, counted, read_only, shown
+from ncs_gym.validation import as_count, as_flag, as_number, as_numbers, counted, read_only, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -357,3 +359,49 @@ def _longest_run(trace: tuple[int, ...]) -> int:
         run = run + 1 if delay < 0 else 0
         longest = max(longest, run)
     return longest
+
+
+class UnusedPacketsWarning(UserWarning):
+    """Packets arrive that no estimate uses."""
+
+
+class DiscardedPackets(NamedTuple):
+    """How many packets of an episode were discarded: too late, stamped ahead, or of another episode."""
+
+    too_late: int = 0
+    ahead: int = 0
+    other_episode: int = 0
+
+    def with_those_of(self, packets: Iterable[Packet], step: int, episode: int, longest_delay: int) -> DiscardedPackets:
+        """Returns the counts with those of the packets that arrive at a step of an episode."""
+        too_late, ahead, other_episode = self
+        for packet in packets:
+            if packet.episode != episode:
+                other_episode += 1
+            elif packet.stamp > step:
+                ahead += 1
+            elif step - packet.stamp > longest_delay:
+                too_late += 1
+        return DiscardedPackets(too_late, ahead, other_episode)
+
+
+def as_packet(value: Any, size: int) -> Packet:
+    """Returns a packet with a measurement of its own, shape (size,), which may be given as a number if size = 1.
+
+    Raises:
+        ValueError: If stamp or episode is no whole number, or the measurement is not numbers of that shape.
+    """
+    stamp = episode = 0
+    try:
+        stamp, measurement, episode = value if isinstance(value, Packet) else Packet(*value)
+        stamp, episode, numbers = index(stamp), index(episode), as_numbers(measurement)
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is not None and numbers.ndim == 0:
+        numbers = numbers.reshape(1)
+    if numbers is None or numbers.shape != (size,):
+        raise ValueError(
+            f"a packet is Packet(stamp, measurement) or Packet(stamp, measurement, episode) with whole numbers and a "
+            f"measurement of shape ({size},), got {shown(value)}"
+        )
+    return Packet(stamp, np.array(numbers), episode)

@@ -1,4 +1,4 @@
-"""The network around any Gymnasium environment."""
+"""The network around any Gymnasium environment, one or many."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.env import NCSEnv
+from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.packet_loss_and_delay import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
 from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,
@@ -24,7 +29,7 @@ from ncs_gym.networked.network_settings import (
     require_no_restarts,
 )
 from ncs_gym.networked.observations import joined, quantized, snapshot, zero_of
-from ncs_gym.validation import shown
+from ncs_gym.validation import AroundEnvironments, require_batched_infos, shown
 
 
 class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
@@ -271,3 +276,269 @@ def nothing(actions: gym.Space) -> Any:
     if isinstance(actions, gym.spaces.MultiDiscrete):
         return zeros + actions.start
     return np.clip(zeros, actions.low, actions.high) if isinstance(actions, gym.spaces.Box) else zeros
+
+
+# Spaces of what is one array, with a first axis more in vector environments.
+_ARRAYS = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+
+
+class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordConstructorArgs):
+    """Puts a network between N environments and their agent; see `Networked`, also for the arguments.
+
+    Observations and actions are one array each. Every environment has a network of its own; all draw from one
+    generator, so that N = 1 is what `Networked` does (with NEXT_STEP until the first episode ends: the step that resets
+    draws, too). It works in all modes of autoreset. Infos are arrays for all environments at each step, without masks.
+    A function for `fill` is given batches: (last, age, actions) have the shapes (N, ...), (N,) and (N, pending, ...).
+    With SAME_STEP `info["final_obs"]` holds what the agent sees last, an array for all environments.
+
+    Args:
+        env: Any vector environment but an `NCSVectorEnv`, which has its own network.
+        channel: See `Networked`.
+        downlink: See `Networked`.
+        observe: See `Networked`; for observations that are a vector of floats.
+        fill: See `Networked`.
+        idle: See `Networked`.
+        neutral: See `Networked`; an action of one environment.
+        pending: See `Networked`.
+
+    Attributes:
+        episode_channels: The channels of the present episodes, N of them.
+        episode_downlinks: The downlinks, likewise; None for an ideal one.
+
+    Raises:
+        ValueError: If a setting is wrong, or does not fit the environments' spaces.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        channel: Channel | Mapping[str, Any] | None = None,
+        downlink: Channel | Mapping[str, Any] | None = None,
+        observe: Sequence[str] = (),
+        fill: str | Predictor = "last",
+        idle: str = "hold",
+        neutral: Any = None,
+        pending: int | None = None,
+    ) -> None:
+        given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "idle": idle}
+        given |= {"neutral": neutral, "pending": pending}
+        if not isinstance(env, VectorEnv):
+            raise ValueError(f"VectorNetworked takes vector environments, as gym.make_vec returns, got {shown(env)}")
+        if isinstance(env.unwrapped, NCSVectorEnv):
+            raise ValueError("expected a vector environment without a network of its own: an NCSVectorEnv has one")
+        require_no_restarts(env)
+        self._settings = settings = NetworkSettings(env.single_observation_space, env.single_action_space, given)
+        for name, space in (("observations", settings.entries.space), ("actions", env.single_action_space)):
+            if not isinstance(space, _ARRAYS):
+                raise ValueError(
+                    f"VectorNetworked takes {name} that are one array, not {shown(space)}: put Networked around each "
+                    "environment"
+                )
+        RecordConstructorArgs.__init__(self, **settings.recorded)
+        VectorWrapper.__init__(self, env)
+        self.single_observation_space = settings.entries.space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        self._links = settings.links(self.num_envs)
+        self._uplinks, self._downlinks = self._links.values()
+        self._nothing = settings.neutral if settings.neutral is not None else nothing(env.single_action_space)
+        self._keeps_actions = "pending_actions" in settings.entries.names or callable(settings.fill)
+        self._started = False
+
+    @property
+    def episode_channels(self) -> tuple[Channel, ...]:
+        """See the class."""
+        return tuple(self._uplinks.now)
+
+    @property
+    def episode_downlinks(self) -> tuple[Channel | None, ...]:
+        """See the class."""
+        return tuple(self._downlinks.now)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts episodes.
+
+        Args:
+            seed: Seeds the networks (a list by its first entry, a number then) and the environments.
+            options: "channel" and "downlink" as for `Networked`, also lists with one for each environment; episodes
+                that begin by autoreset have the environments' own again. "reset_mask", bool (N,), starts some. The
+                rest is the environments'.
+        """
+        first = seed[0] if isinstance(seed, list) else seed
+        if first is None and seed is not None:
+            raise ValueError(f"the first of the seeds seeds the networks, and must be a number, got {shown(seed)}")
+        own, count = dict(options or {}), self.num_envs
+        chosen = np.asarray(own.get("reset_mask", np.ones(count, np.bool_)))
+        own |= {"reset_mask": chosen} if "reset_mask" in own else {}
+        if not self._started:
+            chosen = np.ones(count, np.bool_)
+        sources, rows = self._settings.sources(own, self._links), np.flatnonzero(chosen)
+        if first is not None:
+            self._rng = network_rng(first)
+        drawn = [(links, links.drawn(each, self.np_random, rows.tolist())) for links, each in sources]
+        observations, info = self.env.reset(seed=seed, options=own or None)  # pyright: ignore[reportArgumentType]
+        require_batched_infos(info, "VectorNetworked")
+        require_no_network(info)
+        for links, each in drawn:
+            links.give(each, rows.tolist())
+        everywhere = bool(chosen.all())
+        if not everywhere:
+            self._over = self._over & ~chosen  # what is reset now begins no episode in the next step
+        else:
+            self._make()
+        self._begin(rows, observations, anew=not everywhere)
+        return self._seen(), self._with_network(info)
+
+    def _make(self) -> None:
+        """Makes the memory of all networks, for episodes that begin in all environments."""
+        rng, settings, count = self.np_random, self._settings, self.num_envs
+        self._started = True
+        self._uplinks.begin(rng)
+        self._downlinks.begin(rng)
+        self._link = VectorChannelState(self._uplinks.now, rng, count)
+        self._actuator = None
+        if settings.downlink is not None:
+            self._actuator = _Actuators(settings, VectorChannelState(self._downlinks.now, rng, count), count)
+        self._network = settings.infos(self._links, many=True)
+        self._past: list[np.ndarray] = []  # the last samples sent, newest first
+        self._sample = np.array([])
+        self._stamp, self._arrived = np.zeros(count, np.int64), np.zeros(count, np.bool_)
+        idle = np.repeat(np.asarray(self._nothing)[None], count, axis=0)
+        self._decided = np.repeat(idle[:, None], settings.pending, axis=1)
+        self._applied, self._action_age = idle, np.zeros(count, np.int64)
+        self._steps, self._packets = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        self._over = np.zeros(count, np.bool_)
+
+    def _begin(self, rows: np.ndarray, observations: np.ndarray, *, anew: bool = False) -> None:
+        """Starts episodes in some environments, with their first observations.
+
+        Args:
+            rows: Indices of the environments.
+            observations: Of all environments.
+            anew: Whether other episodes ran before, whose packets are on their way.
+        """
+        rng, first = self.np_random, np.array(observations)
+        if anew:
+            self._link.begin(rng, rows, self._uplinks.begin(rng, rows))
+            if self._actuator is not None:
+                self._actuator.begin(rng, rows, self._downlinks.begin(rng, rows))
+            if not (self._uplinks.is_plain and self._downlinks.is_plain):
+                self._network = self._settings.infos(self._links, many=True)
+        self._sample = self._sample.copy() if anew else first
+        self._sample[rows] = first[rows]
+        self._stamp[rows], self._arrived[rows] = 0, False
+        self._steps[rows] = self._packets[rows] = self._action_age[rows] = 0
+        self._applied[rows] = self._nothing
+        if self._keeps_actions:
+            self._decided[rows] = self._nothing
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Sends the actions, steps the environments with those that act now, and sees what arrives."""
+        if not self._started:
+            raise ResetNeeded("call reset before the first step")
+        rng = self.np_random
+        actions = np.array(actions)
+        restarted = self._over if self._mode is AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, np.bool_)
+        self._applied = actions
+        if self._actuator is not None:
+            require_action(self.action_space, actions)
+            self._applied, self._action_age = self._actuator.exchange(rng, self._steps, actions)
+        if self._keeps_actions:
+            self._decided = np.concatenate([self._decided[:, 1:], actions[:, None]], axis=1)
+        # A copy: environments may change their actions in place, and these may act again.
+        observations, rewards, terminated, truncated, info = self.env.step(self._applied.copy())
+        self._steps += 1
+        done = terminated | truncated
+        ends_now = self._mode is AutoresetMode.SAME_STEP and done.any()
+        sample = np.array(observations)
+        for e in np.flatnonzero(done).tolist() if ends_now else ():
+            sample[e] = info["final_obs"][e]
+        self._exchange(rng, sample)
+        if len(rows := restarted.nonzero()[0]):
+            self._begin(rows, sample, anew=True)
+        if ends_now:
+            ended = info.get("final_info")
+            final = self._with_network(ended if isinstance(ended, dict) else {})
+            info = info | {"final_obs": self._seen(), "final_info": final}
+            info.setdefault("_final_info", done)
+            self._begin(np.flatnonzero(done), observations, anew=True)
+        self._over = done
+        return self._seen(), rewards, terminated, truncated, self._with_network(info)
+
+    def _exchange(self, rng: np.random.Generator, sample: np.ndarray) -> None:
+        """Sends samples where it is time, and takes those that arrive."""
+        self._packets += self._link.send(rng, self._steps)
+        if np.count_nonzero(self._link.channel.quantization_step):
+            sample = quantized(self._link.channel, self._settings.parts[0].space, sample)
+        self._past = [sample, *self._past[: self._link.channel.longest_delay]]
+        before = self._stamp
+        for age, arrives in self._link.arrivals():
+            newer = arrives & (self._steps - age > self._stamp)
+            self._sample = _where(newer, self._past[age], self._sample)
+            self._stamp = np.where(newer, self._steps - age, self._stamp)
+        self._arrived = self._stamp > before
+
+    def _seen(self) -> np.ndarray:
+        """Returns what the agent sees now."""
+        settings, seen, ages = self._settings, self._sample.copy(), self._steps - self._stamp
+        if settings.fill == "zero":  # the first sample of an episode is no arrival
+            seen = _where(self._arrived | (ages == 0), seen, zero_of(settings.parts[0].space))
+        elif callable(settings.fill):
+            settings.warn_of_lacking_actions(int(ages.max()))
+            predicted: Any = settings.fill(seen.copy(), ages, self._decided.copy())
+            if np.shape(predicted) != seen.shape:
+                raise ValueError(
+                    "fill must return the observations of all environments, whose first axis is the environment: "
+                    f"expected {seen.shape}, got {np.shape(predicted)}"
+                )
+            seen = _where(ages == 0, seen, predicted)
+        return settings.entries.added_to(seen, ages[:, None], self._arrived[:, None], self._decided)
+
+    def _with_network(self, info: dict[str, Any]) -> dict[str, Any]:
+        """Returns the environments' infos with those of the networks."""
+        require_no_network(info)
+        return {
+            **info,
+            "measurement_age": self._steps - self._stamp,
+            "packet_arrived": self._arrived.copy(),
+            "action_age": self._action_age.copy(),
+            "action_applied": self._applied.copy(),
+            "packets": self._packets.copy(),
+            **deepcopy(self._network),
+        }
+
+
+class _Actuators:
+    """The commands on their way to N environments and those that act."""
+
+    def __init__(self, settings: NetworkSettings, link: VectorChannelState, count: int) -> None:
+        self._link, self._idle, self._neutral = link, settings.idle, np.asarray(settings.neutral)
+        self._action = np.repeat(self._neutral[None], count, axis=0)
+        self._stamp = np.full(count, -1)
+        self._past: list[np.ndarray] = []
+
+    def begin(self, rng: np.random.Generator, rows: np.ndarray, channels: Any) -> None:
+        """Starts episodes in some environments; what is on its way there never arrives."""
+        self._link.begin(rng, rows, channels)
+        self._action[rows], self._stamp[rows] = self._neutral, -1
+
+    def exchange(
+        self, rng: np.random.Generator, steps: np.ndarray, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Sends actions; returns those that act at these steps, and their ages, -1 for `neutral` [steps]."""
+        self._link.send(rng, steps)
+        self._past = [actions.copy(), *self._past[: self._link.channel.longest_delay]]
+        acts = np.zeros(len(steps), np.bool_)
+        for age, arrives in self._link.arrivals():
+            rows = np.flatnonzero(arrives & (steps - age > self._stamp))
+            self._action[rows], self._stamp[rows], acts[rows] = self._past[age][rows], steps[rows] - age, True
+        decided = acts if self._idle == "neutral" else self._stamp >= 0
+        return _where(decided, self._action, self._neutral), np.where(decided, steps - self._stamp, -1)
+
+
+def _where(chosen: np.ndarray, there: Any, elsewhere: Any) -> np.ndarray:
+    """Returns a batch with the rows of one where a mask (N,) says so and of another elsewhere; either may be a row."""
+    ndim = max(np.ndim(there), np.ndim(elsewhere))
+    return np.where(chosen.reshape(-1, *[1] * (ndim - 1)), there, elsewhere)

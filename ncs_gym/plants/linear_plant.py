@@ -20,8 +20,7 @@ from ncs_gym.model import Model
 from ncs_gym.plants.description import assumptions_of, described
 from ncs_gym.plants.hard_bounds import HardBounds, Source
 from ncs_gym.reading import json_values, read_text
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, read_back
-from ncs_gym.uncertainty.shape_matrices import outer_sum
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, outer_sum, read_back
 from ncs_gym.validation import as_names, counted, read_only, reason_of, setting, shown
 
 # An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.

@@ -11,7 +11,7 @@ import numpy as np
 
 from ncs_gym.bounds import Bounds
 from ncs_gym.limits import Limits
-from ncs_gym.plants.cart_pole import GRAVITY, cart_pole
+from ncs_gym.plants.library import GRAVITY, cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.linearization import linear_model
 from ncs_gym.processes.process import Process

@@ -13,10 +13,10 @@ from ncs_gym import exact
 from ncs_gym.bounds import Bounds, Through
 from ncs_gym.limits import Limits
 from ncs_gym.model import Model
+from ncs_gym.plants.family import Remainder
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.process import Process
-from ncs_gym.uncertainty.remainder import Remainder
 from ncs_gym.validation import as_number
 
 # What `Pendulum-v1` has: gravity [m/s^2], mass [kg], length [m], step [s], largest torque [N m] and rate [rad/s].

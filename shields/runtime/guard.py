@@ -11,9 +11,8 @@ import numpy as np
 
 from ncs_gym import Channel, Ellipsoid
 from ncs_gym.envs.report import Beginning, Belief
-from ncs_gym.network.actuator import CommittedInputs
 from ncs_gym.network.contract import warn_of_broken_contract
-from ncs_gym.network.downlink import DownlinkProtocol
+from ncs_gym.network.downlink import CommittedInputs, DownlinkProtocol
 from ncs_gym.validation import CopiedWhole
 from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (

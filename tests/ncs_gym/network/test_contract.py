@@ -23,8 +23,8 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.estimation.set_membership import SetMembership
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.batch_reactor import batch_reactor
-from ncs_gym.uncertainty.shape_matrices import is_inside
+from ncs_gym.plants.library import batch_reactor
+from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields.verification.rational_matrix import (
     add,
     congruence,

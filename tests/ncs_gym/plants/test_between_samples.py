@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from ncs_gym import LinearPlant, cart_pole, truck_trailer
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from tests.product import altered, sampled_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, LinearPlant, cart_pole, truck_trailer
-from ncs_gym.uncertainty.family import Family
-from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.plants.family import Family, Remainder
 from tests.plants import varying_cart_pole, varying_truck
 from tests.product import altered, family_of, linear_plant, loop_env, rate_limited, sampled_plant
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, LinearPlant, cart_pole, truck_trailer
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from ncs_gym.processes.cart_pole_process import nonlinear_cart_pole
 from tests.plants import delayed
 from tests.product import altered, linear_plant
