@@ -25,7 +25,7 @@ from shields.runtime.set_test import (
 from shields.verification import ACTION_ROUNDING, require_valid
 
 if TYPE_CHECKING:
-    from ncs_gym.estimation.error_table import ErrorTable
+    from ncs_gym.estimation.arrival_histories import ErrorTable
     from shields.runtime.backup_plans import Lookahead
 
 MODES = ("project", "switch", "boundary", "monitor", "lookahead")
