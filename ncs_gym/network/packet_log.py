@@ -9,7 +9,7 @@ import re
 from array import array
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -49,40 +49,6 @@ _STATISTICS = re.compile(
 _NUMBERS = 65536
 # Stamps are no later than this [us].
 _LATEST_STAMP = 1e5
-
-
-class Record(NamedTuple):
-    """What a file says.
-
-    Attributes:
-        sent: When each packet was sent, shape (k,), ascending [s].
-        delays: How long each was on its way, shape (k,); NaN for a lost one [s].
-        read_as: How the file was read, in a sentence.
-    """
-
-    sent: np.ndarray
-    delays: np.ndarray
-    read_as: str
-
-
-def read_record(path: str | os.PathLike[str]) -> Record:
-    """Returns the record in a file: CSV, Parquet, or the output of Linux `ping -D`.
-
-    Raises:
-        ValueError: If the file cannot be read, or is none of these.
-    """
-    try:
-        content = read_file(path, LARGEST_LOG)
-    except OSError as error:
-        raise ValueError(f"cannot read packets from {shown(path)}: {error.strerror or error}") from error
-    try:
-        if content.startswith(b"PING "):
-            return _of_ping(content.decode().replace("\r\n", "\n"))
-        return _of_table(table_rows(content, _chosen, _FORMS))
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{shown(path)}: it is no text in UTF-8; {_FORMS}") from error
-    except ValueError as error:
-        raise ValueError(f"{shown(path)}: {error}") from None
 
 
 def table_rows(content: bytes, chosen: Callable[[list[str]], list[str]], forms: str) -> Iterable[tuple[float, ...]]:
@@ -144,8 +110,8 @@ def _chosen(names: list[str]) -> list[str]:
     return ["sent", "received"]
 
 
-def _of_table(rows: Iterable[tuple[float, ...]]) -> Record:
-    """Returns the packets of a table, whose rows are in the order of sending.
+def _of_table(rows: Iterable[tuple[float, ...]]) -> tuple[np.ndarray, np.ndarray, str]:
+    """Returns times of sending, delays and how it was read, of a table, whose rows are in the order of sending.
 
     A packet without a row is not seen, as in a log of the receiver, which has none of what was lost.
     """
@@ -154,20 +120,10 @@ def _of_table(rows: Iterable[tuple[float, ...]]) -> Record:
         require_packets(count)
         numbers.extend(times)
     sent, received = np.reshape(np.array(numbers), (-1, 2)).T
-    for wrong, words in (
-        (~np.isfinite(sent), "it has no time of sending"),
-        (~(np.abs(sent) < _LATEST_TIME) | (np.abs(received) >= _LATEST_TIME), "its times are too large for seconds"),
-        (np.diff(sent, prepend=sent[:1]) < 0.0, "it was sent before the one above: sort the rows by sent, unless a "
-         "clock was set back, where the record has to be cut"),
-        (received < sent, "it arrived before it was sent: the clocks of sender and receiver differ, set one by the "
-         "other"),
-    ):  # fmt: skip
-        if wrong.any():
-            raise ValueError(f"row {int(np.argmax(wrong)) + 1} of the packets: {words}")
-    return Record(sent, received - sent, "Read as a table: 'sent' in s, 'received' in s.")
+    return sent, received - sent, "Read as a table: 'sent' in s, 'received' in s."
 
 
-def _of_ping(text: str) -> Record:
+def _of_ping(text: str) -> tuple[np.ndarray, np.ndarray, str]:
     """Returns the packets of one run of Linux `ping -D` to one host, of which every line is known.
 
     A packet was sent so long before the stamp of its answer as ping says that the answer took. Stamps that are printed
@@ -223,7 +179,7 @@ def _of_ping(text: str) -> Record:
     delays = np.full(transmitted, np.nan)
     delays[number - 1] = arrived - sent
     read_as = "Read as the output of ping -D: delays are those of the whole way and back."
-    return Record(moments / 1e6, delays / 1e6, read_as)
+    return moments / 1e6, delays / 1e6, read_as
 
 
 def _in_order(number: np.ndarray, sent: np.ndarray, arrived: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -312,15 +268,18 @@ class PacketLog(ReadOnlyArrays):
         if sent is None or delays is None or sent.ndim != 1 or sent.shape != delays.shape or len(sent) < 2:
             raise ValueError("a log needs at least two packets, each with the time at which it was sent")
         require_packets(len(sent))
-        if not np.isfinite(sent).all() or (np.diff(sent) < 0.0).any() or sent[0] == sent[-1]:
-            raise ValueError("packets must be sent one after the other, at finite times")
-        if (delays < 0.0).any() or np.isinf(delays).any():
-            raise ValueError(
-                "a packet arrived before it was sent: the clocks of sender and receiver differ, set one by the other"
-            )
-        object.__setattr__(self, "sent", sent)
-        object.__setattr__(self, "delays", delays)
-        self._make_arrays_read_only()
+        for wrong, words in (
+            (~np.isfinite(sent), "has no time of sending"),
+            ((np.abs(sent) >= _LATEST_TIME) | (delays >= _LATEST_TIME), "has times that are too large for seconds"),
+            (np.diff(sent, prepend=sent[:1]) < 0.0, "was sent before the one above: sort the rows by sent, unless a "
+             "clock was set back, where the record has to be cut"),
+            (delays < 0.0, "arrived before it was sent: the clocks of sender and receiver differ, set one by the "
+             "other"),
+            (sent[-1:] == sent[0], "was sent together with all others: packets are sent one after the other"),
+        ):  # fmt: skip
+            if wrong.any():
+                raise ValueError(f"packet {int(np.argmax(wrong)) + 1} {words}")
+        self._set(sent=sent, delays=delays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
@@ -335,7 +294,18 @@ class PacketLog(ReadOnlyArrays):
             ValueError: If the file cannot be read, is neither, has more than 256 MiB, or more than two million packets
                 with those that were lost.
         """
-        return cls(*read_record(path))
+        try:
+            content = read_file(path, LARGEST_LOG)
+        except OSError as error:
+            raise ValueError(f"cannot read packets from {shown(path)}: {error.strerror or error}") from error
+        try:
+            if content.startswith(b"PING "):
+                return cls(*_of_ping(content.decode().replace("\r\n", "\n")))
+            return cls(*_of_table(table_rows(content, _chosen, _FORMS)))
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{shown(path)}: it is no text in UTF-8; {_FORMS}") from error
+        except ValueError as error:
+            raise ValueError(f"{shown(path)}: {error}") from None
 
     @property
     def period(self) -> float:
