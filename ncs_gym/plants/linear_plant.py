@@ -1,14 +1,15 @@
-"""The linear plant: a model, its limits, what bounds its uncertainties, and what follows from these."""
+"""The linear plant: a model, its limits, what bounds its uncertainties, what follows from these, and how it reads."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
+from textwrap import fill
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -17,12 +18,19 @@ from ncs_gym import exact
 from ncs_gym.bounds import DELTA, Bounds, Sum
 from ncs_gym.limits import Limits, LimitValues, weight_of
 from ncs_gym.model import Model
-from ncs_gym.plants.description import assumptions_of, described
 from ncs_gym.plants.hard_bounds import HardBounds, Source
 from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, outer_sum, read_back
 from ncs_gym.validation import as_names, counted, read_only, reason_of, setting, shown
 
+# Columns of the description: where its texts begin, and where they end.
+_INDENT, _WIDTH = 16, 80
+# What an end of a limit and its operating point differ from each other by rounding, relative to them, is printed as 0.
+_ZERO = 1e-12
+# Stands for a space at which no line ends.
+_UNBROKEN = "\N{NO-BREAK SPACE}"
+_WITHOUT = ("no disturbance acts on the plant", "the sensors measure without noise", "the first estimate is exact")
+_NOISES = ("disturbances", "sensor noise", "the first error")
 # An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
 FARTHEST = 1e30
 # What identifies a plant, beside its sets.
@@ -103,7 +111,14 @@ class LinearPlant(HardBounds):
         self._set(**vars(whole), n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
         self._declare([declared, *sums[1:]], rest)
         self._name()
-        self._check_between_samples()
+        if self.between_samples is not None:
+            has_remainder = len(declared.parts) < len(sums[0].parts)
+            if self.continuous_model is None or self.past or has_remainder or self.step_offset.any():
+                needed = "a model of Model.sampled, without delays, rates, remainder and constant disturbance"
+                raise ValueError(f"between_samples needs {needed}: else nothing is known of times within a step")
+            if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
+                ends = "two ends that bound every state: give generous ones"
+                raise ValueError(f"between_samples needs Limits with {ends}")
         if owned := [each.of_plant(self) for each in sums[0].parts if each.is_left_out]:
             disturbance = Sum((*declared.parts, *owned))
             self._set(remainder=owned[0], bounds=replace(self.bounds, disturbance=disturbance))
@@ -137,17 +152,6 @@ class LinearPlant(HardBounds):
         past = tuple(f"{name} of {age} ago" for age in ages for name in self.input_names)
         self._set(state_names=self.state_names + past, state_units=self.state_units + self.input_units * len(ages))
         self._set(labels={name: dict(labels[name]) for name in labels} or None)
-
-    def _check_between_samples(self) -> None:
-        """Raises ValueError if times between samples count of which nothing is known."""
-        if self.between_samples is None:
-            return
-        has_remainder = any(each.is_left_out for each in self.bounds.disturbance.parts)
-        if self.continuous_model is None or self.past or has_remainder or self.step_offset.any():
-            needed = "a model of Model.sampled, without delays, rates, remainder and constant disturbance"
-            raise ValueError(f"between_samples needs {needed}: else nothing is known of times within a step")
-        if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
-            raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")
 
     @property
     def document(self) -> dict[str, Any]:
@@ -184,9 +188,58 @@ class LinearPlant(HardBounds):
         Path(path).write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
 
     def __str__(self) -> str:
-        return described(self)
+        """Limits, bounds and assumptions for people, with units."""
+        sizes = ", ".join(counted(*each) for each in ((self.n, "state"), (self.m, "input"), (self.p, "output")))
+        radius = f"spectral radius {self.spectral_radius:.6g}"
+        unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
+        k, together = len(self.box), len(self.box) + self.m
+        lines = {
+            "linear plant": [f"{sizes}, a step every {self.dt:g} s"],
+            "dynamics": [f"stable ({radius})" if self.spectral_radius < 1.0 else unstable],
+            "safe box": [row_limit(self, j) for j in np.flatnonzero(~self.is_past_row).tolist()],
+            "input limits": [row_limit(self, j) for j in range(k, together)],
+            "both together": [row_limit(self, j) for j in range(together, together + len(self.mixed_rows))],
+        }
+        if longest := int(self.model.delays.max()):
+            up_to = "up to " if np.ptp(self.model.delays) else ""
+            lines["input limits"].append(f"inputs take effect {up_to}{counted(longest, 'step')} later")
+        if self.between_samples is not None:
+            lines["safe box"].append(f"at all times: at {self.between_samples} of each step, and bounded between them")
+        own = self.n - self.past  # past inputs are known, and their rows limit nothing: inputs have limits
+        states = self.state_names[:own], self.state_units[:own]
+        outputs = of_outputs(self.H, self.state_names), of_outputs(self.H, self.state_units, "")
+        declared = self.bounds.disturbance, self.bounds.sensor, self.bounds.first_error
+        titles = "disturbance", "sensor noise", "first error"
+        for title, each, (names, units) in zip(titles, declared, (states, outputs, states), strict=True):
+            bound, axes = each.sized(len(names)), np.eye(len(names))
+            half, middle = np.broadcast_arrays(bound.support(axes), bound.middle, axes[0])[:2]
+            parts = [
+                f"{name} {f'from {low:.4g} to' if low + high else 'up to'} {_sized(high, unit)}".replace(" ", _UNBROKEN)
+                for name, low, high, unit in zip(names, middle - half, middle + half, units, strict=True)
+            ]
+            lines[title] = [", ".join(parts)]
+        lines["assumptions"], found, indent = [*self.assumptions], [], " " * _INDENT
+        for title, texts in lines.items():
+            found += [fill(text, _WIDTH, initial_indent=indent, subsequent_indent=indent) for text in texts]
+            if texts:
+                found[-len(texts)] = f"{title:<{_INDENT}}{found[-len(texts)][_INDENT:]}"
+        return "\n".join(found).replace(_UNBROKEN, " ")
 
-    assumptions = property(assumptions_of)
+    @property
+    def assumptions(self) -> tuple[str, ...]:
+        """What a certificate takes for granted beyond numbers, in sentences."""
+        held = self.nominal_disturbance, self.nominal_sensor_error, self.nominal_initial_error
+        without = [text for text, each in zip(_WITHOUT, held, strict=True) if not each.shape_matrix.any()]
+        assumed = [f"It is assumed that {text}." for text in without]
+        covariances = self.process_noise_cov, self.measurement_noise_cov, self.initial_cov
+        if truncated := [name for name, each in zip(_NOISES, covariances, strict=True) if each.any()]:
+            kept = f"{100.0 * (1.0 - self.delta):.6g} % (delta = {self.delta:g}) of {', '.join(truncated)}"
+            assumed.append(f"Gaussian noise is truncated: the bounds hold {kept}, not the rest.")
+        if self.remainder is not None:
+            assumed.append(self.remainder.sentence)
+        if self.between_samples is not None:
+            assumed.append("What disturbances have done by any time within a step respects the bound of a whole step.")
+        return tuple(assumed)
 
     def __repr__(self) -> str:
         """Short, since messages and settings of others contain it."""
@@ -298,3 +351,45 @@ def _logarithmic_norm(G: np.ndarray, W: np.ndarray) -> float:
     """
     off = np.abs(G) * (1.0 - np.eye(len(G)))
     return max(float((np.diag(G) + exact.product(off, W) / W).max()), 0.0)
+
+
+def row_limit(plant: LinearPlant, j: int) -> str:
+    """Returns what limit j of the safe box, the inputs and both together says; that of a sum in its largest entry."""
+    n, m = plant.n, plant.m
+    rows = [np.pad(plant.box, ((0, 0), (m, 0))), np.eye(m, m + n), np.roll(plant.mixed_rows, m, axis=1)]
+    ends = np.concatenate([plant.box_ends, plant.input_ends, plant.mixed_ends], axis=1)
+    row, names = np.concatenate(rows)[j], plant.input_names + plant.state_names
+    limited, center = np.flatnonzero(row).tolist(), np.concatenate([plant.operating_input, plant.operating_state])
+    size, unit = np.abs(row).max(), ""
+    if len(limited) == 1:
+        size, unit = row[limited[0]], (plant.input_units + plant.state_units)[limited[0]]
+    factors = [(row[i] / size, names[i]) for i in limited]
+    terms = [f"{'-' if each < 0.0 else '+'} {_factor(abs(each))}{name}" for each, name in factors]
+    name = " ".join(terms).removeprefix("+ ")
+    name = f"-{name[2:]}" if name.startswith("- ") else name
+    (low, high), center = sorted((ends[:, j] / size).tolist()), float(row @ center / size)
+    farthest = max((abs(end) for end in (low, high) if abs(end) < np.inf), default=np.inf)
+    center = 0.0 if abs(center) <= _ZERO * farthest else center
+    if center == 0.0 and low == -high:
+        return f"|{name}| <= {_sized(high, unit)}"
+    point = f" (operating point {center:.6g})" if center else ""
+    bottom, top = (0.0 if abs(center + end) <= _ZERO * abs(center) else center + end for end in (low, high))
+    if low == -np.inf:
+        return f"{name} <= {_sized(top, unit)}{point}"
+    if high == np.inf:
+        return f"{name} >= {_sized(bottom, unit)}{point}"
+    return f"{bottom:.6g} <= {name} <= {_sized(top, unit)}{point}"
+
+
+def _sized(size: float, unit: str) -> str:
+    return f"{size:.4g} {unit}".rstrip()
+
+
+def _factor(size: float) -> str:
+    return "" if size == 1.0 else f"{size:.4g} "
+
+
+def of_outputs(H: np.ndarray, of_states: Sequence[str], otherwise: str = "y{}") -> list[str]:
+    """Returns names, or units, of outputs: those of states that are measured alone, else y1, y2, ..."""
+    alone = (np.abs(H).sum(axis=1) == 1.0) & (H.max(axis=1) == 1.0)
+    return [str(of_states[row.argmax()]) if alone[j] else otherwise.format(j + 1) for j, row in enumerate(H)]

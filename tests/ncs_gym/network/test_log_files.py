@@ -242,7 +242,10 @@ REFUSED = [
     ("sent,received\n0,nan\n1,2\n", "line 2: 'nan' is no number"),
     ('sent,received\n0,"1\n', "line 2 is not of a CSV file"),
     ("sent,received\n0,1\n,2\n", "packet 2 has no time of sending"),
-    ("sent,received\n1700000000000,1700000000012\n1700000000001,\n", "packet 1 has times that are too large for seconds"),
+    (
+        "sent,received\n1700000000000,1700000000012\n1700000000001,\n",
+        "packet 1 has times that are too large for seconds",
+    ),
     ("sent,received\n0,1\n1,1e999\n", "packet 2 has times that are too large for seconds"),
     ("sent,received\n0,1\n", "at least two packets"),
     ("sent,received\n0,1\n0,2\n", "one after the other"),
