@@ -107,9 +107,8 @@ class Factory:
         kinds = JSON_SETTINGS if self.process is None else JSON_SETTINGS | {"process": (type(self.process),)}
         if read is None:
             if self.plant is None:
-                raise ValueError(
-                    "this environment has no plant of its own: give plant=LinearPlant(...), or register_plant it"
-                )
+                found = f"got {', '.join(given)}" if given else "got no settings"
+                raise ValueError(f"this environment has no plant of its own: give plant=LinearPlant(...), {found}")
             read, own["contract"] = _made(self.plant), self.contract or contract_of(self.channel)
         if between_samples is not None:
             read = replace(read, limits=replace(read.limits, between_samples=between_samples))

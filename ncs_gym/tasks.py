@@ -169,8 +169,7 @@ class Regulation(Task):
         for name in ("state_cost", "input_cost"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, as_covariance(value, None, name))
-        self._make_arrays_read_only()
+                self._set(**{name: as_covariance(value, None, name)})
 
     def costs(self, plant: LinearPlant) -> tuple[np.ndarray, np.ndarray]:
         """Returns Q, shape (n, n), and R, (m, m), for a plant."""
@@ -233,14 +232,11 @@ class SetpointTracking(Task):
 
     def __post_init__(self) -> None:
         output = [self.output] if isinstance(self.output, int | float) else self.output
-        object.__setattr__(self, "output", as_vector(output, None, "output"))
-        for name in ("reach", "width"):
-            object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
-        probability = as_number(self.change_probability, "change_probability", low=0.0, high=1.0)
-        object.__setattr__(self, "change_probability", probability)
-        object.__setattr__(self, "preview", as_count(self.preview, "preview", low=0, high=1000))
-        object.__setattr__(self, "change_price", as_number(self.change_price, "change_price", low=0.0))
-        self._make_arrays_read_only()
+        self._set(output=as_vector(output, None, "output"))
+        self._check(as_number, "reach", "width", low=0.0, low_open=True)
+        self._check(as_number, "change_probability", low=0.0, high=1.0)
+        self._check(as_count, "preview", low=0, high=1000)
+        self._check(as_number, "change_price", low=0.0)
 
     def target(self, task_state: Any) -> Any:
         """Returns the target now, a number or shape (N,)."""
@@ -377,16 +373,10 @@ class SpeedTracking(Task):
     vectorized: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        fastest = as_number(self.fastest, "fastest", low=0.0, low_open=True)
-        probability = as_number(self.change_probability, "change_probability", low=0.0, high=1.0)
-        for name, value in (
-            ("fastest", fastest),
-            ("change_probability", probability),
-            ("error_weight", as_number(self.error_weight, "error_weight", low=0.0)),
-            ("input_weight", as_number(self.input_weight, "input_weight", low=0.0)),
-            ("input_index", as_count(self.input_index, "input_index", low=0)),
-        ):
-            object.__setattr__(self, name, value)
+        self._check(as_number, "fastest", low=0.0, low_open=True)
+        self._check(as_number, "change_probability", low=0.0, high=1.0)
+        self._check(as_number, "error_weight", "input_weight", low=0.0)
+        self._check(as_count, "input_index", low=0)
 
     def begin(self, rng, plant, size=None):  # noqa: D102
         return self.fastest * rng.random((2,) if size is None else (2, size))

@@ -6,7 +6,7 @@ import copy
 import sys
 import warnings
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from operator import attrgetter
@@ -55,6 +55,10 @@ class ReadOnlyArrays:
         for name, value in values.items():
             held = isinstance(value, np.ndarray) or type(value) is tuple
             object.__setattr__(self, name, frozen_inside(value) if held else value)
+
+    def _check(self, check: Callable[..., Any], *names: str, **limits: Any) -> None:
+        """Puts what a check such as `as_number` returns of fields, given their names, in their place."""
+        self._set(**{name: check(getattr(self, name), name, **limits) for name in names})
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym.reading import MOST_PACKETS
-from ncs_gym.validation import as_count, as_flag, as_number, as_numbers, counted, read_only, shown
+from ncs_gym.validation import ReadOnlyArrays, as_count, as_flag, as_number, as_numbers, counted, read_only, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -36,7 +36,7 @@ class Packet(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GilbertElliott:
+class GilbertElliott(ReadOnlyArrays):
     """Bursty loss: a two-state Markov chain that moves once per control step (Gilbert 1960, Elliott 1963).
 
     Attributes:
@@ -55,8 +55,7 @@ class GilbertElliott:
     loss_bad: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("p_good_to_bad", "p_bad_to_good", "loss_good", "loss_bad"):
-            object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, high=1.0))
+        self._check(as_number, "p_good_to_bad", "p_bad_to_good", "loss_good", "loss_bad", low=0.0, high=1.0)
 
     @property
     def stationary_bad(self) -> float:
@@ -66,7 +65,7 @@ class GilbertElliott:
 
 
 @dataclass(frozen=True)
-class Channel:
+class Channel(ReadOnlyArrays):
     """What the network does to the samples; every impairment works alone and with the others.
 
     At each step k >= 1 that is a multiple of `send_period` the measurement is quantized, stamped with k
@@ -98,17 +97,14 @@ class Channel:
 
     def __post_init__(self) -> None:
         if isinstance(self.loss, dict):
-            object.__setattr__(self, "loss", _bursts(self.loss))
+            self._set(loss=_bursts(self.loss))
         if not isinstance(self.loss, GilbertElliott):
-            object.__setattr__(self, "loss", as_number(self.loss, "loss", low=0.0, high=1.0))
-        step = as_number(self.quantization_step, "quantization_step", low=0.0)
-        object.__setattr__(self, "quantization_step", step)
-        object.__setattr__(self, "send_period", as_count(self.send_period, "send_period", low=1))
-        for name in ("delay", "jitter"):
-            object.__setattr__(self, name, as_count(getattr(self, name), name, low=0, high=LONGEST_DELAY))
+            self._check(as_number, "loss", low=0.0, high=1.0)
+        self._check(as_number, "quantization_step", low=0.0)
+        self._check(as_count, "send_period", low=1)
+        self._check(as_count, "delay", "jitter", low=0, high=LONGEST_DELAY)
         if self.max_consecutive_losses is not None:
-            most = as_count(self.max_consecutive_losses, "max_consecutive_losses", low=0)
-            object.__setattr__(self, "max_consecutive_losses", most)
+            self._check(as_count, "max_consecutive_losses", low=0)
         if as_flag(self.on_request, "on_request") and self.send_period != 1:
             raise ValueError(
                 f"on request every step may have a sample: leave out send_period, which is {self.send_period}"
@@ -275,7 +271,7 @@ class TraceChannel(Channel):
         if len(self.trace) > MOST_PACKETS:
             raise ValueError(f"a trace has at most {MOST_PACKETS:,} packets, got {len(self.trace):,}")
         if self.dt is not None:
-            object.__setattr__(self, "dt", as_number(self.dt, "dt", low=0.0, low_open=True))
+            self._check(as_number, "dt", low=0.0, low_open=True)
         trace = tuple(as_count(each, "a delay of the trace", low=-1, high=LONGEST_DELAY) for each in self.trace)
         arrived = [each for each in trace if each >= 0] or [0]
         own = {
@@ -289,7 +285,7 @@ class TraceChannel(Channel):
         for name, value in own.items():
             if name != "trace" and getattr(self, name) not in (value, defaults[name]):
                 raise ValueError(f"{name} of a TraceChannel is that of its trace, {value}: leave it out")
-            object.__setattr__(self, name, value)
+        self._set(**own)
         super().__post_init__()
 
     def __repr__(self) -> str:
@@ -299,10 +295,6 @@ class TraceChannel(Channel):
             f"TraceChannel(trace={reprlib.repr(self.trace)} of {counted(len(self.trace), 'sample')}, "
             f"send_period={self.send_period}, quantization_step={self.quantization_step}{more})"
         )
-
-    def __getstate__(self) -> dict[str, Any]:
-        # What is computed once is left out: a copy's array would not be read-only.
-        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     @cached_property
     def mean_loss(self) -> float:
