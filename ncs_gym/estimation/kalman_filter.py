@@ -123,7 +123,6 @@ class SetMembership:
         return factor @ basis, MULTIPLIERS + (1.0 - MULTIPLIERS) * np.maximum(gains, 0.0)
 
     def _gain(self, shape: np.ndarray, mu: float) -> np.ndarray:
-        """Returns T_mu."""
         H = self.plant.H
         spread = shape @ H.T / mu
         innovation = H @ spread + self.noise / (1.0 - mu)

@@ -156,8 +156,10 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         sample = snapshot(observation)
         for part, arrivals, links in zip(self._settings.parts, self._arrivals, self._uplinks, strict=True):
             arrivals.begin(ChannelState(links.now[0], rng), part.of(sample))
-        settings, given = self._settings, self.episode_downlink
-        self._actuator = None if given is None else _Actuator(settings, ChannelState(given, rng))
+        settings, self._commands = self._settings, None
+        if self.episode_downlink is not None:
+            self._commands = _Arrivals()
+            self._commands.begin(ChannelState(self.episode_downlink, rng), settings.neutral, stamp=-1)
         idle = settings.neutral if settings.neutral is not None else nothing(self.action_space)
         self._decided: deque[Any] = deque([idle] * settings.pending, settings.pending)
         return self._seen(), self._with_network(info, idle, 0)
@@ -168,9 +170,11 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             raise gym.error.ResetNeeded("call reset before the first step")
         rng, settings, step = self.np_random, self._settings, self._step
         applied, action_age = action, 0
-        if self._actuator is not None:
+        if (commands := self._commands) is not None:
             require_action(self.action_space, action)
-            applied, action_age = self._actuator.exchange(rng, step, snapshot(action))
+            commands.take(commands.link.carry(rng, step, (step, snapshot(action))))
+            acts = commands.arrived or (settings.idle == "hold" and commands.stamp >= 0)
+            applied, action_age = (commands.sample, step - commands.stamp) if acts else (settings.neutral, -1)
         if self._keeps_actions:
             self._decided.append(snapshot(action))
         # A copy: environments may change their actions in place, and this one may act again.
@@ -191,7 +195,6 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         return self._seen(), reward, terminated, truncated, self._with_network(info, applied, action_age)
 
     def _seen(self) -> Any:
-        """Returns what the agent sees now."""
         settings, step = self._settings, self._step
         if self._sees_newest:
             return snapshot(self._arrivals[0].sample)
@@ -212,7 +215,6 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         return settings.entries.added_to(observation, ages, arrived, pending)
 
     def _with_network(self, info: dict[str, Any], applied: Any, action_age: int) -> dict[str, Any]:
-        """Returns the environment's infos with those of the network."""
         require_no_network(info)
         step, arrivals, by_part = self._step, self._arrivals, self._settings.by_part
         return {
@@ -227,14 +229,14 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
 
 
 class _Arrivals:
-    """What has arrived of a part of the observations: the newest sample, its step, and whether it arrived now."""
+    """What has arrived of a part of observations, or of commands: the newest, its step, and whether it arrived now."""
 
     link: ChannelState
 
-    def begin(self, link: ChannelState, sample: Any) -> None:
-        """Starts an episode, whose first sample is there."""
+    def begin(self, link: ChannelState, sample: Any, stamp: int = 0) -> None:
+        """Starts an episode, with what is there."""
         self.link, self.sample = link, sample
-        self.stamp, self.arrived = 0, False
+        self.stamp, self.arrived = stamp, False
 
     def is_new(self, step: int) -> bool:
         """Returns whether the newest sample arrived at this step, as the first of an episode does."""
@@ -246,24 +248,6 @@ class _Arrivals:
         for stamp, sample in packets:
             if stamp > self.stamp:
                 self.stamp, self.sample, self.arrived = stamp, sample, True
-
-
-class _Actuator:
-    """The commands on their way and the one that acts."""
-
-    def __init__(self, settings: NetworkSettings, link: ChannelState) -> None:
-        self._link, self._idle, self._neutral = link, settings.idle, settings.neutral
-        self._action, self._stamp = settings.neutral, -1
-
-    def exchange(self, rng: np.random.Generator, step: int, action: Any) -> tuple[Any, int]:
-        """Sends an action; returns the one that acts at this step, and its age, -1 for `neutral` [steps]."""
-        arrived = self._link.carry(rng, step, (step, action))
-        newest = max(arrived, key=lambda each: each[0], default=None)
-        if newest is not None and newest[0] > self._stamp:
-            self._stamp, self._action = newest
-        elif self._idle == "neutral" or self._stamp < 0:
-            return self._neutral, -1
-        return self._action, step - self._stamp
 
 
 def nothing(actions: gym.Space) -> Any:
@@ -397,14 +381,11 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         self._started = True
         self._uplinks.begin(rng)
         self._downlinks.begin(rng)
-        self._link = VectorChannelState(self._uplinks.now, rng, count)
-        self._actuator = None
+        self._samples = _ManyArrivals(VectorChannelState(self._uplinks.now, rng, count), count, 0)
+        self._commands = None
         if settings.downlink is not None:
-            self._actuator = _Actuators(settings, VectorChannelState(self._downlinks.now, rng, count), count)
+            self._commands = _ManyArrivals(VectorChannelState(self._downlinks.now, rng, count), count, -1)
         self._network = settings.infos(self._links, many=True)
-        self._past: list[np.ndarray] = []  # the last samples sent, newest first
-        self._sample = np.array([])
-        self._stamp, self._arrived = np.zeros(count, np.int64), np.zeros(count, np.bool_)
         idle = np.repeat(np.asarray(self._nothing)[None], count, axis=0)
         self._decided = np.repeat(idle[:, None], settings.pending, axis=1)
         self._applied, self._action_age = idle, np.zeros(count, np.int64)
@@ -419,16 +400,16 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
             observations: Of all environments.
             anew: Whether other episodes ran before, whose packets are on their way.
         """
-        rng, first = self.np_random, np.array(observations)
+        rng, commands = self.np_random, self._commands
         if anew:
-            self._link.begin(rng, rows, self._uplinks.begin(rng, rows))
-            if self._actuator is not None:
-                self._actuator.begin(rng, rows, self._downlinks.begin(rng, rows))
+            self._samples.link.begin(rng, rows, self._uplinks.begin(rng, rows))
+            if commands is not None:
+                commands.link.begin(rng, rows, self._downlinks.begin(rng, rows))
             if not (self._uplinks.is_plain and self._downlinks.is_plain):
                 self._network = self._settings.infos(self._links, many=True)
-        self._sample = self._sample.copy() if anew else first
-        self._sample[rows] = first[rows]
-        self._stamp[rows], self._arrived[rows] = 0, False
+        self._samples.begin(rows, np.array(observations))
+        if commands is not None:
+            commands.begin(rows, np.repeat(np.asarray(self._settings.neutral)[None], self.num_envs, axis=0))
         self._steps[rows] = self._packets[rows] = self._action_age[rows] = 0
         self._applied[rows] = self._nothing
         if self._keeps_actions:
@@ -442,9 +423,12 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         actions = np.array(actions)
         restarted = self._over if self._mode is AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, np.bool_)
         self._applied = actions
-        if self._actuator is not None:
+        if (commands := self._commands) is not None:
             require_action(self.action_space, actions)
-            self._applied, self._action_age = self._actuator.exchange(rng, self._steps, actions)
+            commands.exchange(rng, self._steps, actions.copy())
+            acts = commands.arrived if self._settings.idle == "neutral" else commands.stamp >= 0
+            self._applied = _where(acts, commands.sample, self._settings.neutral)
+            self._action_age = np.where(acts, self._steps - commands.stamp, -1)
         if self._keeps_actions:
             self._decided = np.concatenate([self._decided[:, 1:], actions[:, None]], axis=1)
         # A copy: environments may change their actions in place, and these may act again.
@@ -455,7 +439,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         sample = np.array(observations)
         for e in np.flatnonzero(done).tolist() if ends_now else ():
             sample[e] = info["final_obs"][e]
-        self._exchange(rng, sample)
+        self._packets += self._samples.exchange(rng, self._steps, sample, self._settings.parts[0].space)
         if len(rows := restarted.nonzero()[0]):
             self._begin(rows, sample, anew=True)
         if ends_now:
@@ -467,24 +451,11 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         self._over = done
         return self._seen(), rewards, terminated, truncated, self._with_network(info)
 
-    def _exchange(self, rng: np.random.Generator, sample: np.ndarray) -> None:
-        """Sends samples where it is time, and takes those that arrive."""
-        self._packets += self._link.send(rng, self._steps)
-        if np.count_nonzero(self._link.channel.quantization_step):
-            sample = quantized(self._link.channel, self._settings.parts[0].space, sample)
-        self._past = [sample, *self._past[: self._link.channel.longest_delay]]
-        before = self._stamp
-        for age, arrives in self._link.arrivals():
-            newer = arrives & (self._steps - age > self._stamp)
-            self._sample = _where(newer, self._past[age], self._sample)
-            self._stamp = np.where(newer, self._steps - age, self._stamp)
-        self._arrived = self._stamp > before
-
     def _seen(self) -> np.ndarray:
-        """Returns what the agent sees now."""
-        settings, seen, ages = self._settings, self._sample.copy(), self._steps - self._stamp
+        samples, settings = self._samples, self._settings
+        seen, ages = samples.sample.copy(), self._steps - samples.stamp
         if settings.fill == "zero":  # the first sample of an episode is no arrival
-            seen = _where(self._arrived | (ages == 0), seen, zero_of(settings.parts[0].space))
+            seen = _where(samples.arrived | (ages == 0), seen, zero_of(settings.parts[0].space))
         elif callable(settings.fill):
             settings.warn_of_lacking_actions(int(ages.max()))
             predicted: Any = settings.fill(seen.copy(), ages, self._decided.copy())
@@ -494,15 +465,14 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
                     f"expected {seen.shape}, got {np.shape(predicted)}"
                 )
             seen = _where(ages == 0, seen, predicted)
-        return settings.entries.added_to(seen, ages[:, None], self._arrived[:, None], self._decided)
+        return settings.entries.added_to(seen, ages[:, None], samples.arrived[:, None], self._decided)
 
     def _with_network(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Returns the environments' infos with those of the networks."""
         require_no_network(info)
         return {
             **info,
-            "measurement_age": self._steps - self._stamp,
-            "packet_arrived": self._arrived.copy(),
+            "measurement_age": self._steps - self._samples.stamp,
+            "packet_arrived": self._samples.arrived.copy(),
             "action_age": self._action_age.copy(),
             "action_applied": self._applied.copy(),
             "packets": self._packets.copy(),
@@ -510,32 +480,33 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         }
 
 
-class _Actuators:
-    """The commands on their way to N environments and those that act."""
+class _ManyArrivals:
+    """What `_Arrivals` is, of N environments, whose episodes begin with what was taken at step `first`."""
 
-    def __init__(self, settings: NetworkSettings, link: VectorChannelState, count: int) -> None:
-        self._link, self._idle, self._neutral = link, settings.idle, np.asarray(settings.neutral)
-        self._action = np.repeat(self._neutral[None], count, axis=0)
-        self._stamp = np.full(count, -1)
-        self._past: list[np.ndarray] = []
+    def __init__(self, link: VectorChannelState, count: int, first: int) -> None:
+        self.link, self._first, self._past = link, first, []
+        self.sample = np.empty(0)
+        self.stamp, self.arrived = np.full(count, first), np.zeros(count, np.bool_)
 
-    def begin(self, rng: np.random.Generator, rows: np.ndarray, channels: Any) -> None:
-        """Starts episodes in some environments; what is on its way there never arrives."""
-        self._link.begin(rng, rows, channels)
-        self._action[rows], self._stamp[rows] = self._neutral, -1
+    def begin(self, rows: np.ndarray, samples: np.ndarray) -> None:
+        """Starts episodes in some environments, with what is there of all N."""
+        self.sample = self.sample.copy() if len(self.sample) else samples
+        self.sample[rows] = samples[rows]
+        self.stamp[rows], self.arrived[rows] = self._first, False
 
-    def exchange(
-        self, rng: np.random.Generator, steps: np.ndarray, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Sends actions; returns those that act at these steps, and their ages, -1 for `neutral` [steps]."""
-        self._link.send(rng, steps)
-        self._past = [actions.copy(), *self._past[: self._link.channel.longest_delay]]
-        acts = np.zeros(len(steps), np.bool_)
-        for age, arrives in self._link.arrivals():
-            rows = np.flatnonzero(arrives & (steps - age > self._stamp))
-            self._action[rows], self._stamp[rows], acts[rows] = self._past[age][rows], steps[rows] - age, True
-        decided = acts if self._idle == "neutral" else self._stamp >= 0
-        return _where(decided, self._action, self._neutral), np.where(decided, steps - self._stamp, -1)
+    def exchange(self, rng: np.random.Generator, steps: np.ndarray, sample: np.ndarray, space: Any = None) -> Any:
+        """Sends where it is time, quantized if a space is given, and takes what arrives; returns which send, (N,)."""
+        sends, channel = self.link.send(rng, steps), self.link.channel
+        if space is not None and np.count_nonzero(channel.quantization_step):
+            sample = quantized(channel, space, sample)
+        self._past = [sample, *self._past[: channel.longest_delay]]
+        before = self.stamp
+        for age, arrives in self.link.arrivals():
+            newer = arrives & (steps - age > self.stamp)
+            self.sample = _where(newer, self._past[age], self.sample)
+            self.stamp = np.where(newer, steps - age, self.stamp)
+        self.arrived = self.stamp > before
+        return sends
 
 
 def _where(chosen: np.ndarray, there: Any, elsewhere: Any) -> np.ndarray:

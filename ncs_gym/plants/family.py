@@ -454,7 +454,6 @@ def _terms(plant: LinearPlant) -> np.ndarray:
 
 
 def _of_plants(members: Any) -> tuple[Family, list[LinearPlant], _Shared]:
-    """Returns the family of plants, these, and what they share."""
     if not isinstance(members, (list, tuple)) or len(members) < 2:
         raise ValueError(f"a family must be two plants or more, or a function of ranges, got {shown(members)}")
     plants = list(members)
@@ -466,7 +465,6 @@ def _of_plants(members: Any) -> tuple[Family, list[LinearPlant], _Shared]:
 def _of_function(
     function: Callable[..., LinearPlant], ranges: Any, monotone: bool
 ) -> tuple[Family, list[LinearPlant], _Shared]:
-    """Returns the family of a function, the plants of its corners, and what they share."""
     if not isinstance(ranges, Mapping) or not 1 <= len(ranges) <= MOST_PARAMETERS:
         form = f"a dictionary of 1 to {MOST_PARAMETERS} parameters with their (low, high)"
         raise ValueError(f"ranges must be {form}, got {shown(ranges)}")

@@ -162,7 +162,6 @@ class NoEquilibriumWarning(UserWarning):
 
 
 def _size_of(limits: Any, point: Any) -> int:
-    """Returns how many entries limits and a point have."""
     numbers = as_setting(limits if point is None else point)
     if numbers is None:  # a number and a vector
         return max((np.size(end) for end in limits), default=1) if isinstance(limits, tuple) else 1

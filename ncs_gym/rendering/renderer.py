@@ -120,7 +120,6 @@ class PhasePlane:
         return self._half * (heights[:, None] * normals + along[:, None] * normals[:, ::-1] * [-1.0, 1.0])
 
     def _draw_sets(self, canvas: Canvas, note: Annotation | None) -> None:
-        """Draws the limits, the safe set and the grid."""
         rect, box = theme.PLANE, self.pixels_of(self._box)
         canvas.polygon(box, theme.PAPER)
         if note is not None and self._outlined[0] is not note.safe_set:
@@ -259,7 +258,6 @@ def _draw_tracked_output(canvas: Canvas, tracked: TrackedOutput, y: float) -> No
 
 
 def _draw_legend(canvas: Canvas, note: Annotation | None) -> None:
-    """Names the marks of the phase plane."""
     marks = [("true state", theme.INK, 0.0), ("estimate", theme.ESTIMATE, 1.5), ("error bound", theme.LATE, 1.5)]
     if note is not None:
         marks += [("safe set", theme.SAFE, 2.0), ("shield acted", theme.SHIELD, 0.0)]
