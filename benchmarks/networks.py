@@ -55,8 +55,8 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, histories_of
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
-from ncs_gym.network.actuator import CommittedInputs
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.network.downlink import CommittedInputs
+from ncs_gym.plants.library import batch_reactor
 from ncs_gym.registration import registered_ids
 from ncs_gym.uncertainty.truncated_gaussian import truncation_energy
 from shields import Certificate, SafetyShield, VectorSafetyShield, certificate_for, synthesize

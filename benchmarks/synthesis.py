@@ -21,8 +21,7 @@ from benchmarks.timing import timed
 from ncs_gym import Ball, Bounds, LinearPlant, cart_pole, family, truck_trailer
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.estimation.error_bound import certified_error_set
-from ncs_gym.plants.convoy import convoy
-from ncs_gym.plants.lane_keeping import lane_keeping
+from ncs_gym.plants.library import convoy, lane_keeping
 from ncs_gym.registration import registered_ids
 from shields import Certificate, Infeasible, synthesize, verify
 from shields.paper.bounds import with_noise

@@ -8,24 +8,20 @@ from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSetError, UnstablePlantError
 from ncs_gym.limits import Limits
 from ncs_gym.model import Model
-from ncs_gym.network.actuator import Actuator, Echo
 from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
 from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
+from ncs_gym.network.downlink import Actuator, Echo
 from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.networked import Networked, VectorNetworked
-from ncs_gym.plants.cart_pole import cart_pole
 from ncs_gym.plants.family import family
+from ncs_gym.plants.library import cart_pole, truck_trailer
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.linearization import linear_model
 from ncs_gym.processes.process import FunctionProcess
 from ncs_gym.recording import bounds_from_recording
 from ncs_gym.registration import register_all, register_plant
-from ncs_gym.tasks.base_task import Task
-from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.tasks.setpoint_tracking import SetpointTracking
-from ncs_gym.tasks.speed_tracking import SpeedTracking
+from ncs_gym.tasks import Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.uncertainty.disturbances import (
     AdversarialDisturbance,
     BoxDisturbance,

@@ -15,7 +15,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, UncertainSet, ellipsoid_around_sum
-from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA, SMALLEST_KEPT, TruncatedGaussian, truncation_energy
+from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA, SMALLEST_KEPT, truncation_energy
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_matrix, as_number, as_setting, shown
 
 # Sizes are squared, and must not become zero or infinite by that.
@@ -71,10 +71,6 @@ class Box(UncertainSet):
     def support(self, direction: np.ndarray) -> Any:  # noqa: D102
         return np.abs(direction) @ np.atleast_1d(self.half)
 
-    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:  # noqa: D102
-        size = len(np.atleast_1d(self.half))
-        return rng.uniform(self.low, self.high, size if count is None else (count, size))
-
 
 @dataclass(frozen=True, eq=False)
 class Ball(UncertainSet):
@@ -105,16 +101,8 @@ class Gaussian(UncertainSet):
         delta = as_number(self.delta, "delta", low=SMALLEST_DELTA, high=1.0 - SMALLEST_KEPT)
         self._set(covariance=covariance, delta=delta, size=len(covariance))
 
-    @cached_property
-    def noise(self) -> TruncatedGaussian:
-        """What is drawn from, truncated or not."""
-        return TruncatedGaussian(self.covariance, truncation_energy(self.delta, len(self.covariance)))
-
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
-        return self.noise.bound
-
-    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:  # noqa: D102
-        return self.noise.sample(rng, count)
+        return Ellipsoid(truncation_energy(self.delta, len(self.covariance)) * self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +127,6 @@ class Through(UncertainSet):
 
     def support(self, direction: np.ndarray) -> Any:  # noqa: D102
         return self.set.support(direction @ self.E)
-
-    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:  # noqa: D102
-        return self.set.sample(rng, count) @ self.E.T
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +165,6 @@ class Sum(UncertainSet):
 
     def support(self, direction: np.ndarray) -> Any:  # noqa: D102
         return sum(each.support(direction) for each in self.parts)
-
-    def sample(self, rng: np.random.Generator, count: int | None = None) -> np.ndarray:  # noqa: D102
-        return np.sum([each.sample(rng, count) for each in self.parts], axis=0)
 
 
 def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -258,14 +240,3 @@ class Bounds(ReadOnlyArrays):
                 needed = f"a set in dimension {size} is needed, got one in dimension {each.size}"
                 raise ValueError(f"Bounds({name}=...): {needed}")
         return sums
-
-
-def noise_in_proportion(half_widths: np.ndarray, H: np.ndarray, disturbance: float, sensor: float) -> Bounds:
-    """Returns Gaussian noise, of which 95 % count, in proportion to half-widths of a safe box, shape (n,).
-
-    Process noise is bounded by a fraction of them, sensor noise by one of what they allow outputs H x, and the first
-    error by that of the smallest one.
-    """
-    outputs, smallest = exact.product(np.abs(H), half_widths), np.full(len(half_widths), half_widths.min())
-    sizes = disturbance * half_widths, sensor * outputs, sensor * smallest
-    return Bounds(*(Gaussian(np.diag(np.square(each)) / truncation_energy(DELTA, len(each)), DELTA) for each in sizes))

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.model import Model, as_point
+from ncs_gym.bounds import pushes_of
+from ncs_gym.model import Model, as_point, residual
 from ncs_gym.validation import (
     LARGEST_NUMBER,
     SMALLEST_NUMBER,
@@ -30,10 +31,19 @@ NEARLY_SYMMETRIC = 1e-12
 FREE_REACH = 100.0
 # Times of a step at which limits of states may count.
 MOST_POINTS = 64
+# Rows of the box keep inputs under way within this many times their limits, which they never leave: the rows only bound
+# the safe set. Closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
+STORED_INPUT_REACH = 4.0
+# A resting point that is found is rounded to this, in units of the limits.
+POINT_PRECISION = 1e-11
 
 
 class ChosenLimitsWarning(UserWarning):
     """No state has a limit: half-widths of the safe box were chosen, far beyond what inputs reach in a few steps."""
+
+
+class MovedOperatingPointWarning(UserWarning):
+    """A disturbance with two different ends moves the point that deviations are counted from."""
 
 
 class Rows(NamedTuple):
@@ -94,25 +104,107 @@ class LimitValues(ReadOnlyArrays):
     step_offset: np.ndarray
     lacking: np.ndarray
 
-    def replaced(self, **changes: Any) -> LimitValues:
-        """Returns the same with some of these attributes changed."""
+    def _replaced(self, **changes: Any) -> LimitValues:
         made = LimitValues()
-        made._set(**self.values | changes)
+        made._set(**{name: getattr(self, name) for name in LimitValues.__annotations__} | changes)
         return made
 
-    @property
-    def values(self) -> dict[str, Any]:
-        """All attributes, by their names."""
-        return {name: getattr(self, name) for name in LimitValues.__annotations__}
+    def at_rest(self, disturbance: Any) -> LimitValues:
+        """Returns the same counted from where it rests under E w, the middle of a disturbance: x = A x + B u + E w.
 
-    def around(self, x: np.ndarray, u: np.ndarray) -> LimitValues:
-        """Returns the same counted from another point, which is (x, u) from here: ends move."""
-        return self.replaced(
+        That is the point of its model if E w = 0, else the nearest such point in units of the limits.
+
+        Raises:
+            ValueError: If no such point lies within the limits.
+        """
+        if not (pushes := pushes_of(disturbance)):
+            return self
+        E, middle = np.hstack([each for each, _ in pushes]), np.concatenate([each for _, each in pushes])
+        x, u, missing = self._resting(E, middle)
+        rest = self._replaced(
             box_ends=self.box_ends - exact.product(self.box, x),
             mixed_ends=self.mixed_ends - exact.product(self.mixed_rows, np.concatenate([x, u])),
             input_ends=self.input_ends - u,
             operating_state=self.operating_state + x,
             operating_input=self.operating_input + u,
+            step_offset=self.step_offset + exact.product(np.abs(E), np.abs(middle)),
+            lacking=np.abs(missing) + self.lacking,
+        )
+        points = rest.operating_state, rest.operating_input
+        place = ", ".join(shown([float(f"{each:.6g}") for each in point]) for point in points)
+        low, high = np.concatenate([rest.box_ends, rest.input_ends, rest.mixed_ends], axis=1)
+        if not ((low < 0.0) & (high > 0.0)).all():
+            raise ValueError(f"a disturbance rests at {place}, not strictly within the limits")
+        text = f"deviations are counted from where the middle of the disturbance rests: {place}"
+        warn_caller(text, MovedOperatingPointWarning)
+        return rest
+
+    def _resting(self, E: np.ndarray, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns x, u, in deviations from the model's point, and A x + B u + E w - x there, which is rounding."""
+        from scipy.linalg import null_space  # takes long to import
+
+        (n, m), A, B, rows = self.B.shape, self.A, self.B, self.box
+        reach = 0.5 * np.ptp(self.input_ends, axis=0)
+        widths = np.sqrt(1.0 / np.diag(weight_of(rows, np.abs(E @ middle))))
+        balance = np.hstack([(np.eye(n) - A) * widths, -B * reach]) / widths[:, None]
+        found = np.linalg.lstsq(balance, E @ middle / widths)[0]
+        directions = null_space(balance)
+        sizes = np.vstack([np.hstack([rows * widths, np.zeros((len(rows), m))]), np.eye(m, n + m, n)])
+        found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
+        x, u = widths * found[:n], reach * found[n:]
+        if not residual(A, B, E, x, u, middle)[1]:
+            pushed = shown((E @ middle).tolist())
+            raise ValueError(f"no state stays where it is under the middle of a disturbance, {pushed} per step")
+        x, u = _in_steps(x, np.abs(rows).max(axis=0)), _in_steps(u, 1.0 / reach)
+        return x, u, residual(A, B, E, x, u, middle)[0]
+
+    def with_past_inputs(self, delays: np.ndarray, change: np.ndarray | None) -> LimitValues:
+        """Returns the plant of the states x, u_{k-d}, .., u_{k-1}, with as many past inputs as it has to remember.
+
+        Args:
+            delays: As of its model, shape (n, m); d is the largest.
+            change: Largest change of each input from one step to the next, shape (m,); None for any.
+
+        Raises:
+            ValueError: If a limit of states and inputs together does not say which past input it means.
+        """
+        (n, m), half, d = self.B.shape, self.input_half, int(delays.max())
+        stored = m * (d or int(change is not None))
+        if not stored:
+            return self
+        A, B = np.zeros((n + stored, n + stored)), np.zeros((n + stored, m))
+        A[:n, :n], A[n:-m, n + m :], B[-m:] = self.A, np.eye(stored - m), np.eye(m)
+        B[:n] = np.where(delays == 0, self.B, 0.0)
+        for steps in range(1, d + 1):
+            A[:n, n + stored - m * steps :][:, :m] = np.where(delays == steps, self.B, 0.0)
+        past = np.hstack([np.zeros((stored, n)), np.diag(np.tile(1.0 / (STORED_INPUT_REACH * half), stored // m))])
+        box = [Rows(np.pad(self.box, ((0, 0), (0, stored))), self.box_ends)]
+        box += [Rows(past, np.tile(self.input_ends / half, stored // m))]
+        # An input that takes effect later is in the limits of states and inputs when it does, and a state by then.
+        of_state, of_input = self.mixed_rows[:, :n], self.mixed_rows[:, n:]
+        others = np.zeros((len(of_state), stored + m))
+        if len(others):
+            others[:, acting(delays, stored)] = of_input
+        is_now, coupled = others[:, stored:].any(axis=1), np.hstack([of_state, others])
+        box.append(Rows(coupled[~is_now, : n + stored], self.mixed_ends[:, ~is_now]))
+        mixed = [Rows(coupled[is_now], self.mixed_ends[:, is_now])]
+        if change is not None:
+            rates = np.hstack([np.zeros((m, n + stored - m)), -np.eye(m), np.eye(m)]) / change[:, None]
+            mixed.append(Rows(rates, np.outer([-1.0, 1.0], np.ones(m))))
+        limited, together = Rows.joined(box, n + stored), Rows.joined(mixed, n + stored + m)
+        number = np.arange(len(limited.rows)) - len(self.box)
+        return self._replaced(
+            A=A,
+            B=B,
+            H=np.pad(self.H, ((0, 0), (0, stored))),
+            box=limited.rows,
+            box_ends=limited.ends,
+            is_past_row=(number >= 0) & (number < stored),
+            mixed_rows=together.rows,
+            mixed_ends=together.ends,
+            operating_state=np.concatenate([self.operating_state, np.tile(self.operating_input, stored // m)]),
+            step_offset=np.pad(self.step_offset, (0, stored)),
+            past=stored,
         )
 
     @cached_property
@@ -218,6 +310,37 @@ def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reac
     for _ in range(len(A)):
         reach = exact.product(np.abs(np.hstack([A, B])), np.concatenate([reach, largest_input]))
     return reach
+
+
+def weight_of(rows: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Returns positive definite W, shape (n, n): C'C of rows c_j, (k, n), regularized by the reach of states in no row.
+
+    That is `HardBounds.reach_from_rest`, shape (n,), in which 0 stands for 1.
+    """
+    gram = exact.product(rows.T, rows)
+    squares, sizes = np.diag(gram), FREE_REACH * np.where(reach > 0.0, reach, 1.0)
+    return gram + np.diag(np.where(squares > 0.0, 1e-6 * squares, 1.0 / np.square(sizes)))
+
+
+def acting(delays: np.ndarray, past: int) -> np.ndarray:
+    """Returns which of past and then present inputs act now, shape (m,), by delays of shape (n, m).
+
+    Raises:
+        ValueError: If an input acts on several states with several delays.
+    """
+    if np.ptp(delays, axis=0).any():
+        raise ValueError("another process, or a limit of states and inputs together, needs one delay per input")
+    return past - delays.shape[1] * delays[0] + np.arange(delays.shape[1])
+
+
+def _in_steps(values: np.ndarray, per_limit: np.ndarray) -> np.ndarray:
+    """Returns values rounded to `POINT_PRECISION` of limits, of which `per_limit` is the inverse, by powers of two.
+
+    What LAPACK finds differs between processors in the last bits, and a point is part of what identifies a plant.
+    """
+    sizes = np.where(per_limit > 0.0, 1.0 / np.where(per_limit > 0.0, per_limit, 1.0), np.maximum(np.abs(values), 1e-9))
+    steps = np.exp2(np.round(np.log2(POINT_PRECISION * sizes)))
+    return np.rint(values / steps) * steps
 
 
 def _beyond(values: np.ndarray, ends: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ncs_gym.bounds import Bounds, Box, Through
 from ncs_gym.model import Model
-from ncs_gym.plants.description import of_outputs
+from ncs_gym.plants.linear_plant import of_outputs
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_names, as_number, as_setting, counted, shown
 
 # A record has at least so many windows, half of which are held against the other half.

@@ -18,21 +18,13 @@ from ncs_gym.envs.json_settings import JSON_SETTINGS, from_json, read_plant, to_
 from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
 from ncs_gym.network.contract import ChannelContract, contract_of
-from ncs_gym.plants.batch_reactor import batch_reactor
-from ncs_gym.plants.cart_pole import cart_pole
-from ncs_gym.plants.convoy import convoy
-from ncs_gym.plants.lane_keeping import lane_keeping
+from ncs_gym.plants.library import batch_reactor, cart_pole, convoy, lane_keeping, stirred_tank, truck_trailer
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.stirred_tank import stirred_tank
-from ncs_gym.plants.truck_trailer import truck_trailer
 from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_pole
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess, inverted_pendulum
 from ncs_gym.processes.process import Process
-from ncs_gym.tasks.base_task import Task
-from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.tasks.setpoint_tracking import SetpointTracking
-from ncs_gym.tasks.speed_tracking import SpeedTracking
+from ncs_gym.tasks import Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.uncertainty.disturbances import BallDisturbance, BoxDisturbance, Disturbance, SinusoidDisturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count
@@ -115,9 +107,8 @@ class Factory:
         kinds = JSON_SETTINGS if self.process is None else JSON_SETTINGS | {"process": (type(self.process),)}
         if read is None:
             if self.plant is None:
-                raise ValueError(
-                    "this environment has no plant of its own: give plant=LinearPlant(...), or register_plant it"
-                )
+                found = f"got {', '.join(given)}" if given else "got no settings"
+                raise ValueError(f"this environment has no plant of its own: give plant=LinearPlant(...), {found}")
             read, own["contract"] = _made(self.plant), self.contract or contract_of(self.channel)
         if between_samples is not None:
             read = replace(read, limits=replace(read.limits, between_samples=between_samples))

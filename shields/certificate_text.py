@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ncs_gym import ChannelContract, LinearPlant
-from ncs_gym.plants.description import row_limit
+from ncs_gym.plants.linear_plant import row_limit
 from ncs_gym.validation import counted, printable
 
 if TYPE_CHECKING:

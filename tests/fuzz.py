@@ -19,7 +19,7 @@ from ncs_gym import (
     SetpointTracking,
     SpeedTracking,
 )
-from ncs_gym.tasks.setpoint_tracking import farthest_equilibrium
+from ncs_gym.tasks import farthest_equilibrium
 from tests.product import linear_plant
 
 

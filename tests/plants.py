@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.random_plants import random_plant as random_plant
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant, cart_pole, truck_trailer
-from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.plants.family import Remainder
 from tests.product import altered, family_of, linear_plant, sampled_plant
 
 

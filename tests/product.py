@@ -19,6 +19,7 @@ import ncs_gym
 import shields
 from ncs_gym import Ball, Bounds, Box, Ellipsoid, Gaussian, Limits, LinearPlant, Model, Sum, Through
 from ncs_gym.envs.belief import Belief
+from ncs_gym.plants import family as families
 from ncs_gym.uncertainty.ellipsoid import UncertainSet
 from ncs_gym.validation import as_setting
 from shields import Certificate
@@ -261,7 +262,12 @@ def _parts(name: str, value: Any) -> list[np.ndarray]:
 
 def family_of(members: Any, ranges: Any = None, **settings: Any) -> LinearPlant:
     """A plant of which several members, or ranges of parameters, are possible; a function is called in few points."""
-    with mock.patch("ncs_gym.plants.family.grid_size", return_value=6):
+
+    def check(*of: Any, whole: Any = families._check_monotone) -> None:
+        with mock.patch.object(families, "grid_size", return_value=6):
+            whole(*of)
+
+    with mock.patch.object(families, "_check_monotone", check):
         return ncs_gym.family(members, ranges, **settings)
 
 

@@ -42,7 +42,7 @@ from ncs_gym import (
 )
 from ncs_gym.envs.loop import Loop
 from ncs_gym.estimation.error_bound import certified_error_set
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from ncs_gym.processes.cart_pole_process import CartPoleProcess
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess

@@ -28,7 +28,7 @@ MODULES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*
 # Folders and modules of each package, from the bottom up: a row imports from itself and from rows above it.
 LAYERS = {
     "ncs_gym": (
-        {"exact", "installation", "reading", "shared", "validation"},
+        {"exact", "installation", "reading", "validation"},
         {"uncertainty", "plants", "model", "limits", "bounds", "recording"},
         {"network", "tasks", "processes"},
         {"estimation", "rendering"},

@@ -11,8 +11,8 @@ import tyro
 
 from experiments.runs.output_folder import require_place
 from ncs_gym import LinearPlant, Sum, Through, bounds_from_recording
-from ncs_gym.network.log_files import table_rows
-from ncs_gym.plants.description import of_outputs
+from ncs_gym.network.packet_log import table_rows
+from ncs_gym.plants.linear_plant import of_outputs
 from ncs_gym.reading import LARGEST_LOG, read_file, require_packets
 from ncs_gym.validation import counted, shown
 

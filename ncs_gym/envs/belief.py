@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.error_table import ErrorTable
+from ncs_gym.estimation.arrival_histories import ErrorTable
 from ncs_gym.validation import frozen
 
 

@@ -19,8 +19,7 @@ from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
 from ncs_gym.rendering import Annotation, Renderer, sent_at
-from ncs_gym.tasks.base_task import Task
-from ncs_gym.tasks.regulation import Regulation
+from ncs_gym.tasks import Regulation, Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, as_flag, setting, shown
 

@@ -15,13 +15,11 @@ from ncs_gym.envs.loop_settings import expect, loop_contracts, starting_set
 from ncs_gym.envs.spaces import nearest_action
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.estimation.vector_estimator import VectorEstimator
-from ncs_gym.network.channel import Channel
+from ncs_gym.estimation.estimator import Estimator, VectorEstimator
+from ncs_gym.network.channel import Channel, UnusedPacketsWarning
 from ncs_gym.network.contract import ChannelContract, largest_age
 from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, VectorDownlinkState, no_inputs
 from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
-from ncs_gym.network.packet_reception import UnusedPacketsWarning
 from ncs_gym.network.requests import Requests
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.plant_step import PlantSimulation

@@ -13,7 +13,7 @@ from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.network.downlink import DownlinkProtocol, downlink_protocol
 from ncs_gym.plants.hard_bounds import weight_of
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.tasks.base_task import Task
+from ncs_gym.tasks import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, as_vector, shown
 

@@ -11,7 +11,7 @@ from gymnasium.spaces import Box
 from ncs_gym.envs.belief import Belief
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.tasks.base_task import Task
+from ncs_gym.tasks import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, counted, shown, warn_caller
 

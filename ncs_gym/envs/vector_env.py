@@ -17,7 +17,7 @@ from ncs_gym.envs.loop import ManyLoops, with_columns
 from ncs_gym.envs.loop_settings import vector_reset_options
 from ncs_gym.envs.spaces import Observer, read_actions
 from ncs_gym.network.channel import Channel
-from ncs_gym.tasks.base_task import Task
+from ncs_gym.tasks import Task
 from ncs_gym.validation import as_count, setting
 
 

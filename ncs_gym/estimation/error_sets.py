@@ -9,7 +9,7 @@ import numpy as np
 from ncs_gym.network.contract import ChannelContract
 from ncs_gym.plants.hard_bounds import INFLATION, SIMULATED_REACH
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.uncertainty.shape_matrices import is_inside
+from ncs_gym.uncertainty.ellipsoid import is_inside
 from ncs_gym.validation import ReadOnlyArrays
 
 

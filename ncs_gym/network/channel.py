@@ -1,17 +1,19 @@
-"""The settings of a network between sensor and controller: loss, transmission period, quantization and delay."""
+"""The settings of a network between sensor and controller: loss, send period, quantization and delay; packets."""
 
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
 from math import isclose
+from operator import index
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ncs_gym.reading import MOST_PACKETS
-from ncs_gym.validation import as_count, as_flag, as_number, counted, read_only, shown
+from ncs_gym.validation import ReadOnlyArrays, as_count, as_flag, as_number, as_numbers, counted, read_only, shown
 
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
@@ -34,7 +36,7 @@ class Packet(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GilbertElliott:
+class GilbertElliott(ReadOnlyArrays):
     """Bursty loss: a two-state Markov chain that moves once per control step (Gilbert 1960, Elliott 1963).
 
     Attributes:
@@ -53,8 +55,7 @@ class GilbertElliott:
     loss_bad: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("p_good_to_bad", "p_bad_to_good", "loss_good", "loss_bad"):
-            object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, high=1.0))
+        self._check(as_number, "p_good_to_bad", "p_bad_to_good", "loss_good", "loss_bad", low=0.0, high=1.0)
 
     @property
     def stationary_bad(self) -> float:
@@ -64,7 +65,7 @@ class GilbertElliott:
 
 
 @dataclass(frozen=True)
-class Channel:
+class Channel(ReadOnlyArrays):
     """What the network does to the samples; every impairment works alone and with the others.
 
     At each step k >= 1 that is a multiple of `send_period` the measurement is quantized, stamped with k
@@ -96,17 +97,14 @@ class Channel:
 
     def __post_init__(self) -> None:
         if isinstance(self.loss, dict):
-            object.__setattr__(self, "loss", _bursts(self.loss))
+            self._set(loss=_bursts(self.loss))
         if not isinstance(self.loss, GilbertElliott):
-            object.__setattr__(self, "loss", as_number(self.loss, "loss", low=0.0, high=1.0))
-        step = as_number(self.quantization_step, "quantization_step", low=0.0)
-        object.__setattr__(self, "quantization_step", step)
-        object.__setattr__(self, "send_period", as_count(self.send_period, "send_period", low=1))
-        for name in ("delay", "jitter"):
-            object.__setattr__(self, name, as_count(getattr(self, name), name, low=0, high=LONGEST_DELAY))
+            self._check(as_number, "loss", low=0.0, high=1.0)
+        self._check(as_number, "quantization_step", low=0.0)
+        self._check(as_count, "send_period", low=1)
+        self._check(as_count, "delay", "jitter", low=0, high=LONGEST_DELAY)
         if self.max_consecutive_losses is not None:
-            most = as_count(self.max_consecutive_losses, "max_consecutive_losses", low=0)
-            object.__setattr__(self, "max_consecutive_losses", most)
+            self._check(as_count, "max_consecutive_losses", low=0)
         if as_flag(self.on_request, "on_request") and self.send_period != 1:
             raise ValueError(
                 f"on request every step may have a sample: leave out send_period, which is {self.send_period}"
@@ -273,7 +271,7 @@ class TraceChannel(Channel):
         if len(self.trace) > MOST_PACKETS:
             raise ValueError(f"a trace has at most {MOST_PACKETS:,} packets, got {len(self.trace):,}")
         if self.dt is not None:
-            object.__setattr__(self, "dt", as_number(self.dt, "dt", low=0.0, low_open=True))
+            self._check(as_number, "dt", low=0.0, low_open=True)
         trace = tuple(as_count(each, "a delay of the trace", low=-1, high=LONGEST_DELAY) for each in self.trace)
         arrived = [each for each in trace if each >= 0] or [0]
         own = {
@@ -287,7 +285,7 @@ class TraceChannel(Channel):
         for name, value in own.items():
             if name != "trace" and getattr(self, name) not in (value, defaults[name]):
                 raise ValueError(f"{name} of a TraceChannel is that of its trace, {value}: leave it out")
-            object.__setattr__(self, name, value)
+        self._set(**own)
         super().__post_init__()
 
     def __repr__(self) -> str:
@@ -297,10 +295,6 @@ class TraceChannel(Channel):
             f"TraceChannel(trace={reprlib.repr(self.trace)} of {counted(len(self.trace), 'sample')}, "
             f"send_period={self.send_period}, quantization_step={self.quantization_step}{more})"
         )
-
-    def __getstate__(self) -> dict[str, Any]:
-        # What is computed once is left out: a copy's array would not be read-only.
-        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     @cached_property
     def mean_loss(self) -> float:
@@ -357,3 +351,49 @@ def _longest_run(trace: tuple[int, ...]) -> int:
         run = run + 1 if delay < 0 else 0
         longest = max(longest, run)
     return longest
+
+
+class UnusedPacketsWarning(UserWarning):
+    """Packets arrive that no estimate uses."""
+
+
+class DiscardedPackets(NamedTuple):
+    """How many packets of an episode were discarded: too late, stamped ahead, or of another episode."""
+
+    too_late: int = 0
+    ahead: int = 0
+    other_episode: int = 0
+
+    def with_those_of(self, packets: Iterable[Packet], step: int, episode: int, longest_delay: int) -> DiscardedPackets:
+        """Returns the counts with those of the packets that arrive at a step of an episode."""
+        too_late, ahead, other_episode = self
+        for packet in packets:
+            if packet.episode != episode:
+                other_episode += 1
+            elif packet.stamp > step:
+                ahead += 1
+            elif step - packet.stamp > longest_delay:
+                too_late += 1
+        return DiscardedPackets(too_late, ahead, other_episode)
+
+
+def as_packet(value: Any, size: int) -> Packet:
+    """Returns a packet with a measurement of its own, shape (size,), which may be given as a number if size = 1.
+
+    Raises:
+        ValueError: If stamp or episode is no whole number, or the measurement is not numbers of that shape.
+    """
+    stamp = episode = 0
+    try:
+        stamp, measurement, episode = value if isinstance(value, Packet) else Packet(*value)
+        stamp, episode, numbers = index(stamp), index(episode), as_numbers(measurement)
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is not None and numbers.ndim == 0:
+        numbers = numbers.reshape(1)
+    if numbers is None or numbers.shape != (size,):
+        raise ValueError(
+            f"a packet is Packet(stamp, measurement) or Packet(stamp, measurement, episode) with whole numbers and a "
+            f"measurement of shape ({size},), got {shown(value)}"
+        )
+    return Packet(stamp, np.array(numbers), episode)

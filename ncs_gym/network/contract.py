@@ -7,7 +7,7 @@ from math import inf
 from typing import overload
 
 from ncs_gym.network.channel import Channel
-from ncs_gym.validation import as_count, as_number, counted, warn_caller
+from ncs_gym.validation import ReadOnlyArrays, as_count, as_number, counted, warn_caller
 
 # There is an error set for every age.
 MAX_AGE = 1000
@@ -18,7 +18,7 @@ class BrokenContractWarning(UserWarning):
 
 
 @dataclass(frozen=True)
-class ChannelContract:
+class ChannelContract(ReadOnlyArrays):
     """At every step the newest sample used is at most `max_age` steps old (docs/contracts.md).
 
     The first estimate counts as a sample at step 0. For an unstable plant an error bound exists only under such a
@@ -36,9 +36,8 @@ class ChannelContract:
     quantization_step: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "max_age", as_count(self.max_age, "max_age", low=0, high=MAX_AGE))
-        step = as_number(self.quantization_step, "quantization_step", low=0.0)
-        object.__setattr__(self, "quantization_step", step)
+        self._check(as_count, "max_age", low=0, high=MAX_AGE)
+        self._check(as_number, "quantization_step", low=0.0)
 
     def follows_from(self, other: ChannelContract | None) -> bool:
         """Returns whether whatever keeps another contract keeps this one, too."""

@@ -1,6 +1,5 @@
 """The network around any Gymnasium environment, single or vectorized: no model, no estimator, no proof."""
 
-from ncs_gym.networked.vector_wrapper import VectorNetworked
-from ncs_gym.networked.wrapper import Networked
+from ncs_gym.networked.wrapper import Networked, VectorNetworked
 
 __all__ = ["Networked", "VectorNetworked"]

@@ -1,4 +1,4 @@
-"""The network around any Gymnasium environment."""
+"""The network around any Gymnasium environment, one or many."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.env import NCSEnv
+from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.network.channel import Channel
-from ncs_gym.network.packet_loss_and_delay import ChannelState
+from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
 from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,
@@ -24,7 +29,7 @@ from ncs_gym.networked.network_settings import (
     require_no_restarts,
 )
 from ncs_gym.networked.observations import joined, quantized, snapshot, zero_of
-from ncs_gym.validation import shown
+from ncs_gym.validation import AroundEnvironments, require_batched_infos, shown
 
 
 class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
@@ -151,8 +156,10 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         sample = snapshot(observation)
         for part, arrivals, links in zip(self._settings.parts, self._arrivals, self._uplinks, strict=True):
             arrivals.begin(ChannelState(links.now[0], rng), part.of(sample))
-        settings, given = self._settings, self.episode_downlink
-        self._actuator = None if given is None else _Actuator(settings, ChannelState(given, rng))
+        settings, self._commands = self._settings, None
+        if self.episode_downlink is not None:
+            self._commands = _Arrivals()
+            self._commands.begin(ChannelState(self.episode_downlink, rng), settings.neutral, stamp=-1)
         idle = settings.neutral if settings.neutral is not None else nothing(self.action_space)
         self._decided: deque[Any] = deque([idle] * settings.pending, settings.pending)
         return self._seen(), self._with_network(info, idle, 0)
@@ -163,9 +170,11 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
             raise gym.error.ResetNeeded("call reset before the first step")
         rng, settings, step = self.np_random, self._settings, self._step
         applied, action_age = action, 0
-        if self._actuator is not None:
+        if (commands := self._commands) is not None:
             require_action(self.action_space, action)
-            applied, action_age = self._actuator.exchange(rng, step, snapshot(action))
+            commands.take(commands.link.carry(rng, step, (step, snapshot(action))))
+            acts = commands.arrived or (settings.idle == "hold" and commands.stamp >= 0)
+            applied, action_age = (commands.sample, step - commands.stamp) if acts else (settings.neutral, -1)
         if self._keeps_actions:
             self._decided.append(snapshot(action))
         # A copy: environments may change their actions in place, and this one may act again.
@@ -186,7 +195,6 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         return self._seen(), reward, terminated, truncated, self._with_network(info, applied, action_age)
 
     def _seen(self) -> Any:
-        """Returns what the agent sees now."""
         settings, step = self._settings, self._step
         if self._sees_newest:
             return snapshot(self._arrivals[0].sample)
@@ -207,7 +215,6 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         return settings.entries.added_to(observation, ages, arrived, pending)
 
     def _with_network(self, info: dict[str, Any], applied: Any, action_age: int) -> dict[str, Any]:
-        """Returns the environment's infos with those of the network."""
         require_no_network(info)
         step, arrivals, by_part = self._step, self._arrivals, self._settings.by_part
         return {
@@ -222,14 +229,14 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
 
 
 class _Arrivals:
-    """What has arrived of a part of the observations: the newest sample, its step, and whether it arrived now."""
+    """What has arrived of a part of observations, or of commands: the newest, its step, and whether it arrived now."""
 
     link: ChannelState
 
-    def begin(self, link: ChannelState, sample: Any) -> None:
-        """Starts an episode, whose first sample is there."""
+    def begin(self, link: ChannelState, sample: Any, stamp: int = 0) -> None:
+        """Starts an episode, with what is there."""
         self.link, self.sample = link, sample
-        self.stamp, self.arrived = 0, False
+        self.stamp, self.arrived = stamp, False
 
     def is_new(self, step: int) -> bool:
         """Returns whether the newest sample arrived at this step, as the first of an episode does."""
@@ -243,24 +250,6 @@ class _Arrivals:
                 self.stamp, self.sample, self.arrived = stamp, sample, True
 
 
-class _Actuator:
-    """The commands on their way and the one that acts."""
-
-    def __init__(self, settings: NetworkSettings, link: ChannelState) -> None:
-        self._link, self._idle, self._neutral = link, settings.idle, settings.neutral
-        self._action, self._stamp = settings.neutral, -1
-
-    def exchange(self, rng: np.random.Generator, step: int, action: Any) -> tuple[Any, int]:
-        """Sends an action; returns the one that acts at this step, and its age, -1 for `neutral` [steps]."""
-        arrived = self._link.carry(rng, step, (step, action))
-        newest = max(arrived, key=lambda each: each[0], default=None)
-        if newest is not None and newest[0] > self._stamp:
-            self._stamp, self._action = newest
-        elif self._idle == "neutral" or self._stamp < 0:
-            return self._neutral, -1
-        return self._action, step - self._stamp
-
-
 def nothing(actions: gym.Space) -> Any:
     """Returns zeros of the kind of an action, for what was decided before the first step."""
     if isinstance(actions, gym.spaces.Discrete):
@@ -271,3 +260,256 @@ def nothing(actions: gym.Space) -> Any:
     if isinstance(actions, gym.spaces.MultiDiscrete):
         return zeros + actions.start
     return np.clip(zeros, actions.low, actions.high) if isinstance(actions, gym.spaces.Box) else zeros
+
+
+# Spaces of what is one array, with a first axis more in vector environments.
+_ARRAYS = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+
+
+class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordConstructorArgs):
+    """Puts a network between N environments and their agent; see `Networked`, also for the arguments.
+
+    Observations and actions are one array each. Every environment has a network of its own; all draw from one
+    generator, so that N = 1 is what `Networked` does (with NEXT_STEP until the first episode ends: the step that resets
+    draws, too). It works in all modes of autoreset. Infos are arrays for all environments at each step, without masks.
+    A function for `fill` is given batches: (last, age, actions) have the shapes (N, ...), (N,) and (N, pending, ...).
+    With SAME_STEP `info["final_obs"]` holds what the agent sees last, an array for all environments.
+
+    Args:
+        env: Any vector environment but an `NCSVectorEnv`, which has its own network.
+        channel: See `Networked`.
+        downlink: See `Networked`.
+        observe: See `Networked`; for observations that are a vector of floats.
+        fill: See `Networked`.
+        idle: See `Networked`.
+        neutral: See `Networked`; an action of one environment.
+        pending: See `Networked`.
+
+    Attributes:
+        episode_channels: The channels of the present episodes, N of them.
+        episode_downlinks: The downlinks, likewise; None for an ideal one.
+
+    Raises:
+        ValueError: If a setting is wrong, or does not fit the environments' spaces.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        channel: Channel | Mapping[str, Any] | None = None,
+        downlink: Channel | Mapping[str, Any] | None = None,
+        observe: Sequence[str] = (),
+        fill: str | Predictor = "last",
+        idle: str = "hold",
+        neutral: Any = None,
+        pending: int | None = None,
+    ) -> None:
+        given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "idle": idle}
+        given |= {"neutral": neutral, "pending": pending}
+        if not isinstance(env, VectorEnv):
+            raise ValueError(f"VectorNetworked takes vector environments, as gym.make_vec returns, got {shown(env)}")
+        if isinstance(env.unwrapped, NCSVectorEnv):
+            raise ValueError("expected a vector environment without a network of its own: an NCSVectorEnv has one")
+        require_no_restarts(env)
+        self._settings = settings = NetworkSettings(env.single_observation_space, env.single_action_space, given)
+        for name, space in (("observations", settings.entries.space), ("actions", env.single_action_space)):
+            if not isinstance(space, _ARRAYS):
+                raise ValueError(
+                    f"VectorNetworked takes {name} that are one array, not {shown(space)}: put Networked around each "
+                    "environment"
+                )
+        RecordConstructorArgs.__init__(self, **settings.recorded)
+        VectorWrapper.__init__(self, env)
+        self.single_observation_space = settings.entries.space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        self._links = settings.links(self.num_envs)
+        self._uplinks, self._downlinks = self._links.values()
+        self._nothing = settings.neutral if settings.neutral is not None else nothing(env.single_action_space)
+        self._keeps_actions = "pending_actions" in settings.entries.names or callable(settings.fill)
+        self._started = False
+
+    @property
+    def episode_channels(self) -> tuple[Channel, ...]:
+        """See the class."""
+        return tuple(self._uplinks.now)
+
+    @property
+    def episode_downlinks(self) -> tuple[Channel | None, ...]:
+        """See the class."""
+        return tuple(self._downlinks.now)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Starts episodes.
+
+        Args:
+            seed: Seeds the networks (a list by its first entry, a number then) and the environments.
+            options: "channel" and "downlink" as for `Networked`, also lists with one for each environment; episodes
+                that begin by autoreset have the environments' own again. "reset_mask", bool (N,), starts some. The
+                rest is the environments'.
+        """
+        first = seed[0] if isinstance(seed, list) else seed
+        if first is None and seed is not None:
+            raise ValueError(f"the first of the seeds seeds the networks, and must be a number, got {shown(seed)}")
+        own, count = dict(options or {}), self.num_envs
+        chosen = np.asarray(own.get("reset_mask", np.ones(count, np.bool_)))
+        own |= {"reset_mask": chosen} if "reset_mask" in own else {}
+        if not self._started:
+            chosen = np.ones(count, np.bool_)
+        sources, rows = self._settings.sources(own, self._links), np.flatnonzero(chosen)
+        if first is not None:
+            self._rng = network_rng(first)
+        drawn = [(links, links.drawn(each, self.np_random, rows.tolist())) for links, each in sources]
+        observations, info = self.env.reset(seed=seed, options=own or None)  # pyright: ignore[reportArgumentType]
+        require_batched_infos(info, "VectorNetworked")
+        require_no_network(info)
+        for links, each in drawn:
+            links.give(each, rows.tolist())
+        everywhere = bool(chosen.all())
+        if not everywhere:
+            self._over = self._over & ~chosen  # what is reset now begins no episode in the next step
+        else:
+            self._make()
+        self._begin(rows, observations, anew=not everywhere)
+        return self._seen(), self._with_network(info)
+
+    def _make(self) -> None:
+        """Makes the memory of all networks, for episodes that begin in all environments."""
+        rng, settings, count = self.np_random, self._settings, self.num_envs
+        self._started = True
+        self._uplinks.begin(rng)
+        self._downlinks.begin(rng)
+        self._samples = _ManyArrivals(VectorChannelState(self._uplinks.now, rng, count), count, 0)
+        self._commands = None
+        if settings.downlink is not None:
+            self._commands = _ManyArrivals(VectorChannelState(self._downlinks.now, rng, count), count, -1)
+        self._network = settings.infos(self._links, many=True)
+        idle = np.repeat(np.asarray(self._nothing)[None], count, axis=0)
+        self._decided = np.repeat(idle[:, None], settings.pending, axis=1)
+        self._applied, self._action_age = idle, np.zeros(count, np.int64)
+        self._steps, self._packets = np.zeros(count, np.int64), np.zeros(count, np.int64)
+        self._over = np.zeros(count, np.bool_)
+
+    def _begin(self, rows: np.ndarray, observations: np.ndarray, *, anew: bool = False) -> None:
+        """Starts episodes in some environments, with their first observations.
+
+        Args:
+            rows: Indices of the environments.
+            observations: Of all environments.
+            anew: Whether other episodes ran before, whose packets are on their way.
+        """
+        rng, commands = self.np_random, self._commands
+        if anew:
+            self._samples.link.begin(rng, rows, self._uplinks.begin(rng, rows))
+            if commands is not None:
+                commands.link.begin(rng, rows, self._downlinks.begin(rng, rows))
+            if not (self._uplinks.is_plain and self._downlinks.is_plain):
+                self._network = self._settings.infos(self._links, many=True)
+        self._samples.begin(rows, np.array(observations))
+        if commands is not None:
+            commands.begin(rows, np.repeat(np.asarray(self._settings.neutral)[None], self.num_envs, axis=0))
+        self._steps[rows] = self._packets[rows] = self._action_age[rows] = 0
+        self._applied[rows] = self._nothing
+        if self._keeps_actions:
+            self._decided[rows] = self._nothing
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Sends the actions, steps the environments with those that act now, and sees what arrives."""
+        if not self._started:
+            raise ResetNeeded("call reset before the first step")
+        rng = self.np_random
+        actions = np.array(actions)
+        restarted = self._over if self._mode is AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, np.bool_)
+        self._applied = actions
+        if (commands := self._commands) is not None:
+            require_action(self.action_space, actions)
+            commands.exchange(rng, self._steps, actions.copy())
+            acts = commands.arrived if self._settings.idle == "neutral" else commands.stamp >= 0
+            self._applied = _where(acts, commands.sample, self._settings.neutral)
+            self._action_age = np.where(acts, self._steps - commands.stamp, -1)
+        if self._keeps_actions:
+            self._decided = np.concatenate([self._decided[:, 1:], actions[:, None]], axis=1)
+        # A copy: environments may change their actions in place, and these may act again.
+        observations, rewards, terminated, truncated, info = self.env.step(self._applied.copy())
+        self._steps += 1
+        done = terminated | truncated
+        ends_now = self._mode is AutoresetMode.SAME_STEP and done.any()
+        sample = np.array(observations)
+        for e in np.flatnonzero(done).tolist() if ends_now else ():
+            sample[e] = info["final_obs"][e]
+        self._packets += self._samples.exchange(rng, self._steps, sample, self._settings.parts[0].space)
+        if len(rows := restarted.nonzero()[0]):
+            self._begin(rows, sample, anew=True)
+        if ends_now:
+            ended = info.get("final_info")
+            final = self._with_network(ended if isinstance(ended, dict) else {})
+            info = info | {"final_obs": self._seen(), "final_info": final}
+            info.setdefault("_final_info", done)
+            self._begin(np.flatnonzero(done), observations, anew=True)
+        self._over = done
+        return self._seen(), rewards, terminated, truncated, self._with_network(info)
+
+    def _seen(self) -> np.ndarray:
+        samples, settings = self._samples, self._settings
+        seen, ages = samples.sample.copy(), self._steps - samples.stamp
+        if settings.fill == "zero":  # the first sample of an episode is no arrival
+            seen = _where(samples.arrived | (ages == 0), seen, zero_of(settings.parts[0].space))
+        elif callable(settings.fill):
+            settings.warn_of_lacking_actions(int(ages.max()))
+            predicted: Any = settings.fill(seen.copy(), ages, self._decided.copy())
+            if np.shape(predicted) != seen.shape:
+                raise ValueError(
+                    "fill must return the observations of all environments, whose first axis is the environment: "
+                    f"expected {seen.shape}, got {np.shape(predicted)}"
+                )
+            seen = _where(ages == 0, seen, predicted)
+        return settings.entries.added_to(seen, ages[:, None], samples.arrived[:, None], self._decided)
+
+    def _with_network(self, info: dict[str, Any]) -> dict[str, Any]:
+        require_no_network(info)
+        return {
+            **info,
+            "measurement_age": self._steps - self._samples.stamp,
+            "packet_arrived": self._samples.arrived.copy(),
+            "action_age": self._action_age.copy(),
+            "action_applied": self._applied.copy(),
+            "packets": self._packets.copy(),
+            **deepcopy(self._network),
+        }
+
+
+class _ManyArrivals:
+    """What `_Arrivals` is, of N environments, whose episodes begin with what was taken at step `first`."""
+
+    def __init__(self, link: VectorChannelState, count: int, first: int) -> None:
+        self.link, self._first, self._past = link, first, []
+        self.sample = np.empty(0)
+        self.stamp, self.arrived = np.full(count, first), np.zeros(count, np.bool_)
+
+    def begin(self, rows: np.ndarray, samples: np.ndarray) -> None:
+        """Starts episodes in some environments, with what is there of all N."""
+        self.sample = self.sample.copy() if len(self.sample) else samples
+        self.sample[rows] = samples[rows]
+        self.stamp[rows], self.arrived[rows] = self._first, False
+
+    def exchange(self, rng: np.random.Generator, steps: np.ndarray, sample: np.ndarray, space: Any = None) -> Any:
+        """Sends where it is time, quantized if a space is given, and takes what arrives; returns which send, (N,)."""
+        sends, channel = self.link.send(rng, steps), self.link.channel
+        if space is not None and np.count_nonzero(channel.quantization_step):
+            sample = quantized(channel, space, sample)
+        self._past = [sample, *self._past[: channel.longest_delay]]
+        before = self.stamp
+        for age, arrives in self.link.arrivals():
+            newer = arrives & (steps - age > self.stamp)
+            self.sample = _where(newer, self._past[age], self.sample)
+            self.stamp = np.where(newer, steps - age, self.stamp)
+        self.arrived = self.stamp > before
+        return sends
+
+
+def _where(chosen: np.ndarray, there: Any, elsewhere: Any) -> np.ndarray:
+    """Returns a batch with the rows of one where a mask (N,) says so and of another elsewhere; either may be a row."""
+    ndim = max(np.ndim(there), np.ndim(elsewhere))
+    return np.where(chosen.reshape(-1, *[1] * (ndim - 1)), there, elsewhere)

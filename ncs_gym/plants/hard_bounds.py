@@ -12,7 +12,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import DELTA, Ball, Sum, pushes_of
-from ncs_gym.limits import FREE_REACH, LimitValues, reach_in_steps
+from ncs_gym.limits import LimitValues, reach_in_steps, weight_of
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid, ellipsoid_around_sum
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from ncs_gym.validation import read_only, setting
@@ -226,13 +226,3 @@ class HardBounds(LimitValues):
 def inflated(shape: np.ndarray) -> np.ndarray:
     """Returns a slightly larger bound, with room for the rounding of its entries, also where it is flat."""
     return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
-
-
-def weight_of(rows: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Returns positive definite W, shape (n, n): C'C of rows c_j, (k, n), regularized by the reach of states in no row.
-
-    That is `reach_from_rest`, shape (n,), in which 0 stands for 1.
-    """
-    gram = exact.product(rows.T, rows)
-    squares, sizes = np.diag(gram), FREE_REACH * np.where(reach > 0.0, reach, 1.0)
-    return gram + np.diag(np.where(squares > 0.0, 1e-6 * squares, 1.0 / np.square(sizes)))

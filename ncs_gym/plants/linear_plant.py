@@ -1,30 +1,36 @@
-"""The linear plant: a model, its limits, what bounds its uncertainties, and what follows from these."""
+"""The linear plant: a model, its limits, what bounds its uncertainties, what follows from these, and how it reads."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from textwrap import fill
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from ncs_gym import exact
 from ncs_gym.bounds import DELTA, Bounds, Sum
-from ncs_gym.limits import Limits, LimitValues
+from ncs_gym.limits import Limits, LimitValues, weight_of
 from ncs_gym.model import Model
-from ncs_gym.plants.between_samples import BetweenSamples
-from ncs_gym.plants.description import assumptions_of, described
-from ncs_gym.plants.hard_bounds import Source, weight_of
-from ncs_gym.plants.past_inputs import with_past_inputs
-from ncs_gym.plants.resting_point import at_rest, with_residual
+from ncs_gym.plants.hard_bounds import HardBounds, Source
 from ncs_gym.reading import json_values, read_text
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, read_back
-from ncs_gym.validation import as_names, counted, read_only, reason_of, shown
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, outer_sum, read_back
+from ncs_gym.validation import as_names, counted, read_only, reason_of, setting, shown
 
+# Columns of the description: where its texts begin, and where they end.
+_INDENT, _WIDTH = 16, 80
+# What an end of a limit and its operating point differ from each other by rounding, relative to them, is printed as 0.
+_ZERO = 1e-12
+# Stands for a space at which no line ends.
+_UNBROKEN = "\N{NO-BREAK SPACE}"
+_WITHOUT = ("no disturbance acts on the plant", "the sensors measure without noise", "the first estimate is exact")
+_NOISES = ("disturbances", "sensor noise", "the first error")
 # An unstable plant that nobody holds runs away no further than this many half-widths: what lies beyond ends in NaN.
 FARTHEST = 1e30
 # What identifies a plant, beside its sets.
@@ -34,15 +40,35 @@ _NUMBERS = (
 )
 _FORMAT = "ncs-gym plant 2"
 _VALUES: dict[str, type] = {"model": Model, "limits": Limits, "bounds": Bounds}
+# What the bound between grid points gains for the rounding of rows, relative to itself and to what a row reaches.
+GRID_MARGIN, GRID_ROUNDING = 0.01, 1e-12
+
+
+class GridRows(NamedTuple):
+    """The rows c of the safe box as rows on x and u at the times tau_i = i dt / N of a step, i = 0..N-1.
+
+    With the input held, x(tau) = A_tau x + B_tau u + d_tau, where [A_tau, B_tau] is the upper part of exp(G tau) for
+    G = [[Ac, Bc], [0, 0]] (docs/shield_proof.md, "Between the samples").
+
+    Attributes:
+        state: c A_tau, shape (N, k, n).
+        input: c B_tau, shape (N, k, m).
+        remainder: eta, shape (k,): for x in the box and u within its limits, c (A_tau x + B_tau u) is nowhere beyond
+            its values at the two grid points around tau by more than this, the rounding of the rows included.
+    """
+
+    state: np.ndarray
+    input: np.ndarray
+    remainder: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearPlant(BetweenSamples):
+class LinearPlant(HardBounds):
     """x+ = A x + B u + d, y = H x + v, with limits and bounds (docs/shield_proof.md).
 
     States and inputs are deviations from an operating point: that of the model, which the middle of a disturbance moves
     to where it rests. Past inputs are the last states if inputs take effect late or their change is limited. What
-    follows is listed by `LimitValues`, `HardBounds` and `BetweenSamples`. `dataclasses.replace` makes another plant.
+    follows is listed by `LimitValues` and `HardBounds`. `dataclasses.replace` makes another plant.
 
     Attributes:
         model: The equations.
@@ -50,6 +76,8 @@ class LinearPlant(BetweenSamples):
         bounds: Each a sum of sets.
         labels: Names of states and inputs with their units, {"states": {"angle": "rad"}, "inputs": {"voltage": "V"}}.
         region: Digest of the model and the limits, which a remainder belongs to.
+        state_names, state_units, input_names, input_units: The labels, with defaults.
+        dt, continuous_model, between_samples: Those of the model and the limits.
 
     Raises:
         ValueError: If the values do not fit each other.
@@ -60,6 +88,13 @@ class LinearPlant(BetweenSamples):
     bounds: Bounds
     labels: Mapping[str, Any] | None = None
     region: str = field(init=False)
+    state_names: tuple[str, ...] = field(init=False)
+    state_units: tuple[str, ...] = field(init=False)
+    input_names: tuple[str, ...] = field(init=False)
+    input_units: tuple[str, ...] = field(init=False)
+    dt = setting("dt", "model.dt")
+    continuous_model = setting("continuous_model", "model.continuous")
+    between_samples = setting("between_samples", "limits.between_samples")
 
     def __post_init__(self) -> None:
         for name, kind in _VALUES.items():
@@ -68,26 +103,34 @@ class LinearPlant(BetweenSamples):
         model, n = self.model, len(self.model.A)
         sums = self.bounds.sums(n, len(model.H))
         declared = sums[0].declared
-        rest = at_rest(self.limits.around(model), declared.sized(n))
+        rest = self.limits.around(model).at_rest(declared.sized(n))
         region = model.A, model.B, model.dt, rest.box, *rest.box_ends, rest.input_ends
         region += rest.mixed_rows, *rest.mixed_ends
         self._set(bounds=Bounds(*sums), remainder=None, region=_digest(enumerate(region)))
-        whole = with_past_inputs(rest, model.delays, self.limits.change_within(rest.input_half))
-        self._set(**whole.values, n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
+        whole = rest.with_past_inputs(model.delays, self.limits.change_within(rest.input_half))
+        self._set(**vars(whole), n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
         self._declare([declared, *sums[1:]], rest)
         self._name()
-        self._check_between_samples()
+        if self.between_samples is not None:
+            has_remainder = len(declared.parts) < len(sums[0].parts)
+            if self.continuous_model is None or self.past or has_remainder or self.step_offset.any():
+                needed = "a model of Model.sampled, without delays, rates, remainder and constant disturbance"
+                raise ValueError(f"between_samples needs {needed}: else nothing is known of times within a step")
+            if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
+                ends = "two ends that bound every state: give generous ones"
+                raise ValueError(f"between_samples needs Limits with {ends}")
         if owned := [each.of_plant(self) for each in sums[0].parts if each.is_left_out]:
             disturbance = Sum((*declared.parts, *owned))
             self._set(remainder=owned[0], bounds=replace(self.bounds, disturbance=disturbance))
 
     def _declare(self, sums: list[Sum], rest: LimitValues) -> None:
-        n, rows = len(rest.A), rest.box
-        weight, past = weight_of(rows, np.zeros(n)), self.past
+        n, past = len(rest.A), self.past
+        weight = weight_of(rest.box, np.zeros(n))
         disturbance = Source.of(sums[0], weight, past, keeps_ball=True)
-        if rest.lacking.any():
+        if rest.lacking.any():  # twice that is held, in units of the rows
             shape = np.zeros((n, n)) if disturbance.bound is None else disturbance.bound.shape_matrix[:n, :n]
-            held = with_residual(Ellipsoid(shape), rest.lacking, rows).shape_matrix
+            gram, lacking = exact.product(rest.box.T, rest.box), np.diag(n * np.square(2.0 * rest.lacking))
+            held = outer_sum(shape, lacking, gram + np.eye(n) * np.trace(gram) / n)
             disturbance = disturbance._replace(bound=Ellipsoid(np.pad(held, (0, past))))
         sensor, first = Source.of(sums[1], np.eye(self.p)), Source.of(sums[2], weight, past)
         self._set(of_disturbance=disturbance, of_sensor=sensor, of_first_error=first)
@@ -145,20 +188,67 @@ class LinearPlant(BetweenSamples):
         Path(path).write_text(json.dumps(self.document, indent=1) + "\n", encoding="utf-8")
 
     def __str__(self) -> str:
-        return described(self)
+        """Limits, bounds and assumptions for people, with units."""
+        sizes = ", ".join(counted(*each) for each in ((self.n, "state"), (self.m, "input"), (self.p, "output")))
+        radius = f"spectral radius {self.spectral_radius:.6g}"
+        unstable = f"not stable ({radius}): a certificate needs a contract of the channel"
+        k, together = len(self.box), len(self.box) + self.m
+        lines = {
+            "linear plant": [f"{sizes}, a step every {self.dt:g} s"],
+            "dynamics": [f"stable ({radius})" if self.spectral_radius < 1.0 else unstable],
+            "safe box": [row_limit(self, j) for j in np.flatnonzero(~self.is_past_row).tolist()],
+            "input limits": [row_limit(self, j) for j in range(k, together)],
+            "both together": [row_limit(self, j) for j in range(together, together + len(self.mixed_rows))],
+        }
+        if longest := int(self.model.delays.max()):
+            up_to = "up to " if np.ptp(self.model.delays) else ""
+            lines["input limits"].append(f"inputs take effect {up_to}{counted(longest, 'step')} later")
+        if self.between_samples is not None:
+            lines["safe box"].append(f"at all times: at {self.between_samples} of each step, and bounded between them")
+        own = self.n - self.past  # past inputs are known, and their rows limit nothing: inputs have limits
+        states = self.state_names[:own], self.state_units[:own]
+        outputs = of_outputs(self.H, self.state_names), of_outputs(self.H, self.state_units, "")
+        declared = self.bounds.disturbance, self.bounds.sensor, self.bounds.first_error
+        titles = "disturbance", "sensor noise", "first error"
+        for title, each, (names, units) in zip(titles, declared, (states, outputs, states), strict=True):
+            bound, axes = each.sized(len(names)), np.eye(len(names))
+            half, middle = np.broadcast_arrays(bound.support(axes), bound.middle, axes[0])[:2]
+            parts = [
+                f"{name} {f'from {low:.4g} to' if low + high else 'up to'} {_sized(high, unit)}".replace(" ", _UNBROKEN)
+                for name, low, high, unit in zip(names, middle - half, middle + half, units, strict=True)
+            ]
+            lines[title] = [", ".join(parts)]
+        lines["assumptions"], found, indent = [*self.assumptions], [], " " * _INDENT
+        for title, texts in lines.items():
+            found += [fill(text, _WIDTH, initial_indent=indent, subsequent_indent=indent) for text in texts]
+            if texts:
+                found[-len(texts)] = f"{title:<{_INDENT}}{found[-len(texts)][_INDENT:]}"
+        return "\n".join(found).replace(_UNBROKEN, " ")
 
-    assumptions = property(assumptions_of)
+    @property
+    def assumptions(self) -> tuple[str, ...]:
+        """What a certificate takes for granted beyond numbers, in sentences."""
+        held = self.nominal_disturbance, self.nominal_sensor_error, self.nominal_initial_error
+        without = [text for text, each in zip(_WITHOUT, held, strict=True) if not each.shape_matrix.any()]
+        assumed = [f"It is assumed that {text}." for text in without]
+        covariances = self.process_noise_cov, self.measurement_noise_cov, self.initial_cov
+        if truncated := [name for name, each in zip(_NOISES, covariances, strict=True) if each.any()]:
+            kept = f"{100.0 * (1.0 - self.delta):.6g} % (delta = {self.delta:g}) of {', '.join(truncated)}"
+            assumed.append(f"Gaussian noise is truncated: the bounds hold {kept}, not the rest.")
+        if self.remainder is not None:
+            assumed.append(self.remainder.sentence)
+        if self.between_samples is not None:
+            assumed.append("What disturbances have done by any time within a step respects the bound of a whole step.")
+        return tuple(assumed)
 
     def __repr__(self) -> str:
         """Short, since messages and settings of others contain it."""
         counts = ((self.n, "state"), (self.m, "input"), (self.p, "output"))
         return f"<LinearPlant: {', '.join(counted(*each) for each in counts)}, fingerprint {self.fingerprint[:16]}>"
 
-    @cached_property
+    @property
     def without_remainder(self) -> LinearPlant:
         """The same plant without its remainder."""
-        if self.remainder is None:
-            return self
         return replace(self, bounds=replace(self.bounds, disturbance=self.bounds.disturbance.declared))
 
     @property
@@ -170,6 +260,61 @@ class LinearPlant(BetweenSamples):
     def state_limit(self) -> np.ndarray:
         """Where a simulation stops a state that runs away, shape (n,); infinite for a stable plant."""
         return read_only(FARTHEST * self.half_widths if self.spectral_radius >= 1.0 else np.full(self.n, np.inf))
+
+    @cached_property
+    def grid_rows(self) -> GridRows | None:
+        """What the box says between samples, the same on every machine; None if only the sampling instants count.
+
+        Between two grid points a function leaves its linear interpolation by at most h^2/8 times its largest second
+        derivative, here [c, 0] G^2 exp(G tau) (x, u). In the norm |q|_W = sum |q_j| W_j, with W the largest |x_j| and
+        |u_j|, that grows from one grid point to the next by at most exp(h m), m the logarithmic norm of G.
+
+        Raises:
+            OverflowError: If it is out of reach of float64.
+        """
+        model, points = self.continuous_model, self.between_samples
+        if points is None:
+            return None
+        G, h = np.concatenate([model, np.zeros((self.m, self.n + self.m))]), self.dt / points
+        rows, W = np.pad(self.box, ((0, 0), (0, self.m))), np.concatenate([self._widest(), self.largest_input])
+        try:
+            times = [self.dt * i / points for i in range(1, points)]
+            onward = [rows, *(exact.product(rows, exact.exponential(G, time)) for time in times)]
+            bends = [exact.product(np.abs(exact.product(each, G, G)), W) for each in onward]
+            sizes = [exact.product(np.abs(each), W) for each in onward]
+            growth = float(exact.exponential(np.array([[_logarithmic_norm(G, W)]]), h)[0, 0])
+        except OverflowError as error:
+            raise OverflowError(
+                "the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
+            ) from error
+        remainder = (1.0 + GRID_MARGIN) * (h * h / 8.0) * growth * np.max(bends, axis=0)
+        remainder = remainder + GRID_ROUNDING * np.max(sizes, axis=0)
+        state, applied = np.split(np.array(onward), [self.n], axis=2)
+        return GridRows(read_only(state), read_only(applied), read_only(remainder))
+
+    @cached_property
+    def _rows_within_step(self) -> np.ndarray | None:
+        """Rows on (x, u, x+) that are c x(tau_i), i = 1..N-1, shape ((N - 1) k, 2 n + m); None as of `grid_rows`.
+
+        What a disturbance did has come in proportion to the time: d_tau = (tau / dt) (x+ - A x - B u) is in E(D), too.
+        """
+        if (rows := self.grid_rows) is None:
+            return None
+        shares = (np.arange(1, len(rows.state)) / len(rows.state))[:, None, None]
+        moved, pushed = rows.state[1:] - shares * (self.box @ self.A), rows.input[1:] - shares * (self.box @ self.B)
+        return np.concatenate([moved, pushed, shares * self.box], axis=2).reshape(-1, 2 * self.n + self.m)
+
+    def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
+        """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
+
+        Shape (k + q,) or (k + q, N), for x, x+ of shape (n,) or (n, N) and the input that was held, (m,) or (m, N).
+        """
+        values, rows = self.constraint_values(x_next), self._rows_within_step
+        if rows is not None:
+            reached = rows.dot(np.concatenate([state, u, x_next])).reshape(-1, *values.shape)
+            low, high = self.box_ends if values.ndim == 1 else self.box_ends[:, :, None]
+            values = np.maximum(np.maximum(reached.max(axis=0) - high, low - reached.min(axis=0)), values)
+        return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values
 
     @cached_property
     def fingerprint(self) -> str:
@@ -197,3 +342,54 @@ def _digest(numbers: Iterable[tuple[Any, Any]]) -> str:
         array = np.asarray(value, dtype="<f8") + 0.0
         digest.update(f"{name}{array.shape}".encode() + array.tobytes())
     return digest.hexdigest()
+
+
+def _logarithmic_norm(G: np.ndarray, W: np.ndarray) -> float:
+    """Returns m = max_i (G_ii + sum_{j != i} |G_ij| W_j / W_i), at least 0.
+
+    In the norm max |z_j| / W_j of columns, and so in |q|_W of rows, |exp(G s)| <= exp(s m).
+    """
+    off = np.abs(G) * (1.0 - np.eye(len(G)))
+    return max(float((np.diag(G) + exact.product(off, W) / W).max()), 0.0)
+
+
+def row_limit(plant: LinearPlant, j: int) -> str:
+    """Returns what limit j of the safe box, the inputs and both together says; that of a sum in its largest entry."""
+    n, m = plant.n, plant.m
+    rows = [np.pad(plant.box, ((0, 0), (m, 0))), np.eye(m, m + n), np.roll(plant.mixed_rows, m, axis=1)]
+    ends = np.concatenate([plant.box_ends, plant.input_ends, plant.mixed_ends], axis=1)
+    row, names = np.concatenate(rows)[j], plant.input_names + plant.state_names
+    limited, center = np.flatnonzero(row).tolist(), np.concatenate([plant.operating_input, plant.operating_state])
+    size, unit = np.abs(row).max(), ""
+    if len(limited) == 1:
+        size, unit = row[limited[0]], (plant.input_units + plant.state_units)[limited[0]]
+    factors = [(row[i] / size, names[i]) for i in limited]
+    terms = [f"{'-' if each < 0.0 else '+'} {_factor(abs(each))}{name}" for each, name in factors]
+    name = " ".join(terms).removeprefix("+ ")
+    name = f"-{name[2:]}" if name.startswith("- ") else name
+    (low, high), center = sorted((ends[:, j] / size).tolist()), float(row @ center / size)
+    farthest = max((abs(end) for end in (low, high) if abs(end) < np.inf), default=np.inf)
+    center = 0.0 if abs(center) <= _ZERO * farthest else center
+    if center == 0.0 and low == -high:
+        return f"|{name}| <= {_sized(high, unit)}"
+    point = f" (operating point {center:.6g})" if center else ""
+    bottom, top = (0.0 if abs(center + end) <= _ZERO * abs(center) else center + end for end in (low, high))
+    if low == -np.inf:
+        return f"{name} <= {_sized(top, unit)}{point}"
+    if high == np.inf:
+        return f"{name} >= {_sized(bottom, unit)}{point}"
+    return f"{bottom:.6g} <= {name} <= {_sized(top, unit)}{point}"
+
+
+def _sized(size: float, unit: str) -> str:
+    return f"{size:.4g} {unit}".rstrip()
+
+
+def _factor(size: float) -> str:
+    return "" if size == 1.0 else f"{size:.4g} "
+
+
+def of_outputs(H: np.ndarray, of_states: Sequence[str], otherwise: str = "y{}") -> list[str]:
+    """Returns names, or units, of outputs: those of states that are measured alone, else y1, y2, ..."""
+    alone = (np.abs(H).sum(axis=1) == 1.0) & (H.max(axis=1) == 1.0)
+    return [str(of_states[row.argmax()]) if alone[j] else otherwise.format(j + 1) for j, row in enumerate(H)]

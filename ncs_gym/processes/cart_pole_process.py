@@ -11,11 +11,11 @@ import numpy as np
 
 from ncs_gym.bounds import Bounds
 from ncs_gym.limits import Limits
-from ncs_gym.plants.cart_pole import GRAVITY, cart_pole
+from ncs_gym.plants.library import GRAVITY, cart_pole
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.linearization import linear_model
 from ncs_gym.processes.process import Process
-from ncs_gym.validation import as_number, shown
+from ncs_gym.validation import ReadOnlyArrays, as_number, shown
 
 # Steps of the integrator in one control step: at 0.01 s its error is far below the rounding of an action.
 SUBSTEPS = 2
@@ -25,7 +25,7 @@ SAMPLES = 8_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class CartPoleProcess(Process):
+class CartPoleProcess(ReadOnlyArrays, Process):
     """A cart with a pole, a point mass on a light rod, without friction.
 
     With position p, angle a from upright and force u, M the cart's mass, m the pole's and l its length:
@@ -47,8 +47,7 @@ class CartPoleProcess(Process):
     vectorized: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        for name in ("cart_mass", "pole_mass", "length"):
-            object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
+        self._check(as_number, "cart_mass", "pole_mass", "length", low=0.0, low_open=True)
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns the process itself; raises ValueError unless the plant has four states and one input."""

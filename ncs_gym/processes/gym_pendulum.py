@@ -13,11 +13,11 @@ from ncs_gym import exact
 from ncs_gym.bounds import Bounds, Through
 from ncs_gym.limits import Limits
 from ncs_gym.model import Model
+from ncs_gym.plants.family import Remainder
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.process import Process
-from ncs_gym.uncertainty.remainder import Remainder
-from ncs_gym.validation import as_number
+from ncs_gym.validation import ReadOnlyArrays, as_number
 
 # What `Pendulum-v1` has: gravity [m/s^2], mass [kg], length [m], step [s], largest torque [N m] and rate [rad/s].
 GRAVITY, MASS, LENGTH, STEP, TORQUE, FASTEST = 10.0, 1.0, 1.0, 0.05, 2.0, 8.0
@@ -31,7 +31,7 @@ STEP_ROUNDING = 1e-14
 
 
 @dataclass(frozen=True, kw_only=True)
-class PendulumProcess(Process):
+class PendulumProcess(ReadOnlyArrays, Process):
     """Gymnasium's `Pendulum-v1`, x = (angle from upright [rad], angular rate [rad/s]), u the torque [N m].
 
     Attributes:
@@ -48,8 +48,7 @@ class PendulumProcess(Process):
     length: float = LENGTH
 
     def __post_init__(self) -> None:
-        for name in ("gravity", "mass", "length"):
-            object.__setattr__(self, name, as_number(getattr(self, name), name, low=0.0, low_open=True))
+        self._check(as_number, "gravity", "mass", "length", low=0.0, low_open=True)
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns the opened environments."""

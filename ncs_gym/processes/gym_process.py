@@ -86,7 +86,6 @@ class OpenedEnv(Process):
             raise
 
     def _action_form(self, space: Any, plant: LinearPlant) -> tuple[Any, tuple[int, ...]]:
-        """Returns dtype and shape of actions."""
         if not isinstance(space, Box):
             raise ValueError(f"GymProcess needs an environment with a Box of actions, got {type(space).__name__}")
         if self._write_action is None:
@@ -152,8 +151,6 @@ def _without_time_limits(env: gym.Env) -> gym.Env:
 
 
 class _OpenedEnvs(Process):
-    """Inner environments of a vector, stepped one after the other."""
-
     vectorized = True
 
     def __init__(self, inner: list[OpenedEnv]) -> None:

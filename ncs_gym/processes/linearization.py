@@ -12,11 +12,10 @@ from ncs_gym import exact
 from ncs_gym.bounds import Bounds, Box, Sum
 from ncs_gym.limits import Limits
 from ncs_gym.model import Model
+from ncs_gym.plants.family import Remainder
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import FunctionProcess, LinearProcess, Process
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
-from ncs_gym.uncertainty.remainder import Remainder
-from ncs_gym.uncertainty.shape_matrices import rounded_up
+from ncs_gym.uncertainty.ellipsoid import Ellipsoid, rounded_up
 from ncs_gym.validation import as_count, as_matrix, as_number, as_setting, counted, shown, warn_caller
 
 # Fresh samples that check a bound, as a fraction of those that it was found with.
@@ -163,7 +162,6 @@ class NoEquilibriumWarning(UserWarning):
 
 
 def _size_of(limits: Any, point: Any) -> int:
-    """Returns how many entries limits and a point have."""
     numbers = as_setting(limits if point is None else point)
     if numbers is None:  # a number and a vector
         return max((np.size(end) for end in limits), default=1) if isinstance(limits, tuple) else 1

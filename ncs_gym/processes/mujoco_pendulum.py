@@ -18,7 +18,7 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.gym_process import GymProcess
 from ncs_gym.processes.linearization import linear_model
 from ncs_gym.processes.process import Process
-from ncs_gym.validation import as_number
+from ncs_gym.validation import ReadOnlyArrays, as_number
 
 # Safe box: position [m], angle [rad], speed [m/s], angular rate [rad/s]. The rail ends at 1 m; beyond 0.2 rad the
 # environment ends its episodes.
@@ -28,7 +28,7 @@ LARGEST, STEP = 3.0, 0.04
 
 
 @dataclass(frozen=True, kw_only=True)
-class InvertedPendulumProcess(Process):
+class InvertedPendulumProcess(ReadOnlyArrays, Process):
     """Gymnasium's `InvertedPendulum-v5`: x = (position [m], angle [rad], speed [m/s], angular rate [rad/s]).
 
     Attributes:
@@ -41,7 +41,7 @@ class InvertedPendulumProcess(Process):
     mass_factor: float = 1.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mass_factor", as_number(self.mass_factor, "mass_factor", low=0.0, low_open=True))
+        self._check(as_number, "mass_factor", low=0.0, low_open=True)
 
     def opened(self, plant: LinearPlant, size: int | None) -> Process:
         """Returns the opened environments; raises ModuleNotFoundError if MuJoCo is missing."""

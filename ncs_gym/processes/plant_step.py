@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.bounds import Bounds
+from ncs_gym.limits import acting
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.plants.past_inputs import acting
 from ncs_gym.processes.process import FamilyProcess, LinearProcess, Process, own_process
 from ncs_gym.uncertainty.disturbances import BY_NAME, ROUNDING, Disturbance, checked
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid

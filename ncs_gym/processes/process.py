@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.validation import as_flag, as_setting, shown
+from ncs_gym.validation import ReadOnlyArrays, as_flag, as_setting, shown
 
 
 class Process:
@@ -157,7 +157,7 @@ def as_process(value: Any) -> Process:
 
 
 @dataclass(frozen=True)
-class FunctionProcess(Process):
+class FunctionProcess(ReadOnlyArrays, Process):
     """x+ = f(x, u) + d for a function f; d is what the plant declares beside its remainder.
 
     Attributes:
@@ -174,7 +174,7 @@ class FunctionProcess(Process):
     def __post_init__(self) -> None:
         if not callable(self.function):
             raise ValueError(f"the process must be a function (x, u) -> x+, got {shown(self.function)}")
-        object.__setattr__(self, "vectorized", as_flag(self.vectorized, "vectorized"))
+        self._check(as_flag, "vectorized")
 
     def step(self, plant: LinearPlant, state: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Returns what the function returns; raises ValueError if that is no finite state."""

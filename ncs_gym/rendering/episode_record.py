@@ -13,9 +13,7 @@ import numpy as np
 from ncs_gym.network.channel import Packet
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.tasks.base_task import Task
-from ncs_gym.tasks.setpoint_tracking import SetpointTracking
-from ncs_gym.tasks.speed_tracking import SpeedTracking
+from ncs_gym.tasks import SetpointTracking, SpeedTracking, Task
 
 # Number of steps of the path and of the packets that a frame shows.
 RECENT_STEPS = 40

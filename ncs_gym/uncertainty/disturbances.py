@@ -15,7 +15,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.shared import begun_many, storing_nothing
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import (
     LARGEST_NUMBER,
@@ -25,7 +24,9 @@ from ncs_gym.validation import (
     as_number,
     as_setting,
     as_vector,
+    begun_many,
     shown,
+    storing_nothing,
 )
 
 # Extreme points are pulled in, and points out by rounding pushed in, by this much.

@@ -10,10 +10,9 @@ import numpy as np
 
 from ncs_gym import Channel, Ellipsoid
 from ncs_gym.envs.belief import Belief
-from ncs_gym.estimation.error_table import ErrorTable
-from ncs_gym.network.actuator import CommittedInputs
+from ncs_gym.estimation.arrival_histories import ErrorTable
 from ncs_gym.network.contract import largest_age, warn_of_broken_contract
-from ncs_gym.network.downlink import IDEAL_DOWNLINK, DownlinkProtocol
+from ncs_gym.network.downlink import IDEAL_DOWNLINK, CommittedInputs, DownlinkProtocol
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
 from ncs_gym.validation import CopiedWhole
 from shields.runtime.decisions import Decision

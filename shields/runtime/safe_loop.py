@@ -13,11 +13,9 @@ from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, Packet
 from ncs_gym.envs.belief import Belief
 from ncs_gym.estimation.arrival_histories import arrival_histories
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.network.actuator import AppliedInputs, Command, CommittedInputs, Echo, as_echo
-from ncs_gym.network.channel import require_on_request
+from ncs_gym.network.channel import DiscardedPackets, UnusedPacketsWarning, as_packet, require_on_request
 from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
-from ncs_gym.network.downlink import downlink_protocol
-from ncs_gym.network.packet_reception import DiscardedPackets, UnusedPacketsWarning, as_packet
+from ncs_gym.network.downlink import AppliedInputs, Command, CommittedInputs, Echo, as_echo, downlink_protocol
 from ncs_gym.network.requests import Requests
 from ncs_gym.validation import (
     CopiedWhole,

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ncs_gym import LinearPlant
-from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER, is_inside
+from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside
 from ncs_gym.validation import frozen, read_only
 from shields.certificate import Certificate, CertificateError
 from shields.runtime.projection import closest_admissible, closest_between, closest_in_interval, closest_on_line

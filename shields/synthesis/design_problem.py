@@ -11,8 +11,8 @@ import numpy as np
 from ncs_gym import ChannelContract, ErrorSetError, LinearPlant, UnstablePlantError, exact
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.plants.between_samples import GridRows
-from ncs_gym.uncertainty.shape_matrices import is_inside, joined
+from ncs_gym.plants.linear_plant import GridRows
+from ncs_gym.uncertainty.ellipsoid import is_inside, joined
 from shields.errors import Infeasible
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.verification import ACTION_ROUNDING

@@ -6,8 +6,8 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from ncs_gym.estimation.error_bound import unseen_state
-from ncs_gym.plants.description import row_limit
-from ncs_gym.plants.hard_bounds import FREE_REACH
+from ncs_gym.limits import FREE_REACH
+from ncs_gym.plants.linear_plant import row_limit
 from shields.errors import Infeasible
 from shields.synthesis.tolerance import Tolerated
 

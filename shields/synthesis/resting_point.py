@@ -12,7 +12,7 @@ from scipy.optimize import linprog
 from ncs_gym import LinearPlant, exact
 from ncs_gym.plants.hard_bounds import inflated, weight_of
 from ncs_gym.plants.lqr import lqr_gain
-from ncs_gym.uncertainty.shape_matrices import outer_sum
+from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import Rest, SymmetricLimits, taken_between_samples
 

@@ -9,7 +9,7 @@ from fractions import Fraction
 import numpy as np
 
 from ncs_gym import Ellipsoid, LinearPlant
-from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
+from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate, Updates
 from shields.verification.between_samples import between_conditions
 from shields.verification.condition import ACTION_ROUNDING, Condition, flag, matrix_condition, scalar_condition

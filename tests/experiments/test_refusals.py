@@ -75,7 +75,7 @@ USAGE = [
 
 ONE_SENTENCE = [
     ("fly", "unknown command 'fly'; there are compare, train, evaluate"),
-    ("compare --env CartPole-v1", "has no plant of its own: register_plant", "ncs_gym.Networked puts a network"),
+    ("compare --env CartPole-v1", "has no plant of its own", "ncs_gym.Networked puts a network"),
     ("compare --env ncs_gym/LinearNCS-v0", "has no plant of its own"),
     ("compare --env cstr", "unknown environment 'cstr'; known are", "ncs_gym/CSTR-v0"),
     ("channel nofile.csv", "cannot read packets from nofile.csv: No such file or directory"),

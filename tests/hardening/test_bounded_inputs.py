@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, LinearPlant, PacketLog, TraceChannel, truck_trailer
+from ncs_gym.plants.family import Remainder
 from ncs_gym.reading import (
     LARGEST_DOCUMENT,
     LARGEST_LOG,
@@ -17,7 +18,6 @@ from ncs_gym.reading import (
     MOST_VALUES,
     json_values,
 )
-from ncs_gym.uncertainty.remainder import Remainder
 from shields import Certificate, CertificateError
 from shields.verification.between_samples import between_conditions
 from tests.certificates import certificate_of

@@ -83,7 +83,7 @@ def call(function, *arguments):
 @on_x86
 @pytest.mark.slow
 @pytest.mark.parametrize("wide", [False, True])
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
 def test_operating_points_that_are_found_are_the_same_under_other_kernels(wide):
     expected = {name: plant.fingerprint for name, plant in plants_around_points().items()}
     assert json.loads(under("Prescott", *call(print_points), wide=wide)) == expected

@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import time
 from dataclasses import replace
-from importlib import import_module
 
 import cvxpy as cp
 import numpy as np
 import pytest
 
 from ncs_gym import Limits, LinearPlant, Model, Through, bounds_from_recording
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants import library
+from ncs_gym.plants.library import batch_reactor
 from ncs_gym.plants.lqr import lqr_gain
 from tests.product import library_plant
 
@@ -43,7 +43,7 @@ def servo(H=((1.0, 0.0),)):
 
 def case_of(name):
     """A plant whose states are measured, directions, half-widths of its disturbance and of its sensors."""
-    plant = library_plant(getattr(import_module(f"ncs_gym.plants.{name}"), name))
+    plant = library_plant(getattr(library, name))
     part = plant.bounds.disturbance.parts[0]
     E = part.E if isinstance(part, Through) else None
     half = np.sqrt(np.diag(plant.disturbance.shape_matrix)) if E is None else part.set.half

@@ -51,15 +51,15 @@ from ncs_gym.envs.env import RenderModeError, ncs_env
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.model import zero_order_hold
-from ncs_gym.network.actuator import Command
+from ncs_gym.network.downlink import Command
 from ncs_gym.network.gaussian_bound import bound_violation_probability
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.family import Remainder
+from ncs_gym.plants.library import batch_reactor
 from ncs_gym.processes.cart_pole_process import CartPoleProcess
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
 from ncs_gym.processes.process import LinearProcess
 from ncs_gym.uncertainty.disturbances import as_disturbance, checked
-from ncs_gym.uncertainty.remainder import Remainder
 from tests.product import altered, linear_plant
 
 TRUCK, POLE, LINEAR = "ncs_gym/TruckTrailer-v0", "ncs_gym/CartPole-v0", "ncs_gym/LinearNCS-v0"

@@ -9,7 +9,7 @@ import pytest
 from ncs_gym import Channel, ChannelContract, NCSEnv
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from tests.product import loop_env
 
 ID = "ncs_gym/TruckTrailerCruise-v0"

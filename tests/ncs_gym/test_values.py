@@ -101,7 +101,7 @@ def test_limits_of_states_and_inputs_together_are_of_the_input_that_acts_then():
         LinearPlant(model.with_delays([[2, 0], [1, 0]]), Limits([1.0, 2.0], 1.0, rows), BOUNDS)
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
 @pytest.mark.parametrize("seed", [3, 10, 18])
 def test_what_the_point_lacks_of_rest_is_inside_where_large_pushes_cancel(seed):
     inner, w = np.random.default_rng(seed).uniform(0.1, 1.0, (2, 2)), np.array([0.3, 0.7])

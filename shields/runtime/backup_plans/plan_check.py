@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.uncertainty.shape_matrices import SMALLEST_MULTIPLIER
+from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
 from shields.runtime.rows_within_step import RowsWithinStep, closed, rows_within_step, supports
 from shields.runtime.set_test import SMALLEST_RADIUS, SetTest, ball, judged_shapes

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Actuator, Channel, ChannelContract, GilbertElliott, SpeedTracking, truck_trailer
-from ncs_gym.network.actuator import Command
+from ncs_gym.network.downlink import Command
 from tests.ncs_gym.envs.same_draws import compare
 from tests.product import loop_env, vector_env
 

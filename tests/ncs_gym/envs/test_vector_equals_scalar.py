@@ -10,7 +10,7 @@ import pytest
 
 from ncs_gym import Channel, ChannelContract, GilbertElliott, SetpointTracking, SpeedTracking, cart_pole, truck_trailer
 from ncs_gym.estimation import arrival_histories
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from tests import arrays
 from tests.ncs_gym.envs.same_draws import compare
 from tests.plants import random_plant

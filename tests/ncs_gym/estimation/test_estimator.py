@@ -13,8 +13,13 @@ from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.innovation import quick_test
-from ncs_gym.estimation.kalman_filter import ErrorRecursion, predicted_covariance, updated_covariance
-from ncs_gym.estimation.set_membership import SetMembership, enlarged_by_rounding
+from ncs_gym.estimation.kalman_filter import (
+    ErrorRecursion,
+    SetMembership,
+    enlarged_by_rounding,
+    predicted_covariance,
+    updated_covariance,
+)
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.plants.hard_bounds import FLAT_INFLATION

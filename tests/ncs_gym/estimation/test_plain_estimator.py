@@ -16,7 +16,7 @@ from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from tests import arrays
 from tests.fuzz import channels, examples, plants
 from tests.ncs_gym.estimation.plain_estimator import PlainEstimator

@@ -16,15 +16,14 @@ from ncs_gym import (
     contract_of,
     truck_trailer,
 )
-from ncs_gym.estimation import kalman_filter, set_membership
+from ncs_gym.estimation import kalman_filter
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.error_bound import certified_error_set, require_error_set
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
-from ncs_gym.estimation.set_membership import SetMembership
+from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics, SetMembership
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.batch_reactor import batch_reactor
-from ncs_gym.uncertainty.shape_matrices import is_inside
+from ncs_gym.plants.library import batch_reactor
+from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields.verification.rational_matrix import (
     add,
     congruence,
@@ -200,7 +199,7 @@ def test_prediction_falls_back_to_the_certified_set(monkeypatch):
     plant, contract = PLANTS["cart-pole"]
     sets = certified_error_set(plant, contract)
     membership = SetMembership(plant, 0.0, sets)
-    monkeypatch.setattr(set_membership, "outer_sum", lambda first, second, weight: 1e3 * (first + second))
+    monkeypatch.setattr(kalman_filter, "outer_sum", lambda first, second, weight: 1e3 * (first + second))
     monkeypatch.setattr(type(sets), "rate_at", lambda self, age: 1e-6)
     shape = membership.predicted(sets.shapes[1], 1)
     np.testing.assert_array_equal(shape, sets.shapes[2])

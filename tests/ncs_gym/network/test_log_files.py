@@ -188,7 +188,7 @@ def test_parquet_is_read_as_csv_is(written, tmp_path, monkeypatch):
     for wrong, words in (
         (table.assign(size=60), "are ['sent', 'received', 'size']; a record is a table"),
         (table.assign(sent=pd.to_datetime(table.sent, unit="s")), "not numbers of 64 bits; a record"),
-        (table.assign(sent=table.received), "row 2 of the packets: it has no time of sending"),
+        (table.assign(sent=table.received), "packet 2 has no time of sending"),
     ):
         wrong.to_parquet(file, index=False)
         with pytest.raises(ValueError, match=re.escape(words)):
@@ -208,7 +208,7 @@ REFUSED = [
     (PING.replace(f"{HOST}: icmp_seq=3", "10.0.0.99: icmp_seq=3"), "line 4 is an answer of another host, '10.0.0.99'"),
     (PING.replace("ms\n", "ms (DIFFERENT ADDRESS!)\n", 1), "line 2 is none of Linux ping -D in English"),
     ("sent,received,can_id\n0,0.1,1\n1,1.1,2\n2,2.1,1\n", "are ['sent', 'received', 'can_id']"),
-    ("sent,received\n0,0.01\n1,0.01\n", "row 2 of the packets: it arrived before it was sent: the clocks"),
+    ("sent,received\n0,0.01\n1,0.01\n", "packet 2 arrived before it was sent: the clocks"),
     ("pub_time(ms) sub_time(ms) delay(ms)\n0 5 5\n20 25 5\n", "are ['pub_time(ms) sub_time(ms) delay(ms)']"),
     (PING.replace(at("2.01"), "[2024-05-27 12:04:44.268336] "), "line 3 is none of Linux ping -D in English, '[2024-"),
     ("\r\nPinging 192.0.2.1 with 32 bytes of data:\r\nPING: transmit failed. General failure.\r\n", "are []"),
@@ -232,7 +232,7 @@ REFUSED = [
     (ended("ping: Warning: time of day goes back (-2us), taking countermeasures\n" + LINES, 5), "line 2 is none of"),
     (run([*RUN, (6, 3, "0.01")], 6), "line 7: the clock was set back by 2000000 us: record anew"),
     (run(BACK, 39), "between the packets 17 and 22 its stamps leave too little time for the lost ones"),
-    ("sent,received\n0,1\n5,\n3,4\n", "row 3 of the packets: it was sent before the one above: sort the rows by sent"),
+    ("sent,received\n0,1\n5,\n3,4\n", "packet 3 was sent before the one above: sort the rows by sent"),
     # Tables.
     ("0.0,0.1\n0.2,0.3\n", "are ['0.0', '0.1']"),
     ("sent;received\n0;1\n1;2\n", "are ['sent;received']"),
@@ -241,9 +241,12 @@ REFUSED = [
     ("sent,received\n2026-01-01T10:00:00,\n", "line 2: '2026-01-01T10:00:00' is no number"),
     ("sent,received\n0,nan\n1,2\n", "line 2: 'nan' is no number"),
     ('sent,received\n0,"1\n', "line 2 is not of a CSV file"),
-    ("sent,received\n0,1\n,2\n", "row 2 of the packets: it has no time of sending"),
-    ("sent,received\n1700000000000,1700000000012\n", "row 1 of the packets: its times are too large for seconds"),
-    ("sent,received\n0,1\n1,1e999\n", "row 2 of the packets: its times are too large for seconds"),
+    ("sent,received\n0,1\n,2\n", "packet 2 has no time of sending"),
+    (
+        "sent,received\n1700000000000,1700000000012\n1700000000001,\n",
+        "packet 1 has times that are too large for seconds",
+    ),
+    ("sent,received\n0,1\n1,1e999\n", "packet 2 has times that are too large for seconds"),
     ("sent,received\n0,1\n", "at least two packets"),
     ("sent,received\n0,1\n0,2\n", "one after the other"),
 ]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from ncs_gym import LinearPlant, cart_pole, truck_trailer
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from tests.product import altered, sampled_plant
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -146,7 +146,7 @@ def held(**more):
     return sampled_plant(OSCILLATOR, dt=1.5, **PUSHED | {"box": [2.0, 3.0]} | bound | more)
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
 def test_constant_disturbance_is_refused_beside_between_samples_also_where_two_cancel_at_the_samples():
     both = {"disturbance_bound": ([[0.0, 0.0], [0.6, -0.6]], [0.0, 0.0], [1.0, 1.0])}
     cancel = {"disturbance_bound": ([[0.0], [0.6]], [-1.0], [0.0])}

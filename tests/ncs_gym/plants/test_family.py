@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, LinearPlant, cart_pole, truck_trailer
-from ncs_gym.uncertainty.family import Family
-from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.plants.family import Family, Remainder
 from tests.plants import varying_cart_pole, varying_truck
 from tests.product import altered, family_of, linear_plant, loop_env, rate_limited, sampled_plant
 
@@ -348,7 +347,7 @@ def test_two_ended_disturbances_move_each_member():
     assert 0.02 <= width <= 0.02 + 5e-8  # what the members' rest lacks of an equilibrium by rounding is inside
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
 def test_middle_of_members_that_a_disturbance_moves_to_one_point_is_about_that_point():
     def pushed(a):
         push = ([[1.0], [0.0]], [0.0], [1.0])
@@ -375,7 +374,7 @@ def read_back(plant):
 
 
 @pytest.mark.parametrize("known", [lambda plant: plant, read_back], ids=["made", "read"])
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
 def test_members_belong_to_the_point_that_they_are_in_deviations_from(known):
     point = {"operating_state": [1.0, 0.5], "operating_input": [0.3]}
     for plant in (family_of(two(B=[[0.0], [0.4]])), family_of([linear_plant(**SMALL | point)] * 2)):
@@ -388,7 +387,7 @@ def test_members_belong_to_the_point_that_they_are_in_deviations_from(known):
 
 
 @pytest.mark.cases(1)
-@pytest.mark.filterwarnings("ignore::ncs_gym.plants.resting_point.MovedOperatingPointWarning")
+@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
 @pytest.mark.parametrize("low", [0.25, 0.5, 0.11])
 def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low):
     def of(a):

@@ -7,9 +7,7 @@ from scipy.linalg import expm
 from scipy.stats import chi2
 
 from ncs_gym import truck_trailer
-from ncs_gym.plants.convoy import convoy
-from ncs_gym.plants.lane_keeping import lane_keeping
-from ncs_gym.plants.stirred_tank import stirred_tank
+from ncs_gym.plants.library import convoy, lane_keeping, stirred_tank
 from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
 from tests.product import altered, library_plant
 

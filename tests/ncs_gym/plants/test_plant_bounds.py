@@ -60,7 +60,7 @@ REGISTERED = {
     truck_trailer: "95e3532724d6",
     lambda: truck_trailer(4000.0): "03c8442904a7",
     ncs_gym.cart_pole: "a24fdb2082ae",
-    ncs_gym.plants.batch_reactor.batch_reactor: "c4e17ad0a41a",
+    ncs_gym.plants.library.batch_reactor: "c4e17ad0a41a",
     pendulum: "8ec05e31669c",
     nonlinear_cart_pole: "bc0bbe28eb93",
     inverted_pendulum: "484e1ba16a42",

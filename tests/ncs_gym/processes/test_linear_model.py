@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, Ellipsoid, FunctionProcess, LinearPlant
-from ncs_gym.plants.resting_point import MovedOperatingPointWarning
+from ncs_gym.limits import MovedOperatingPointWarning
+from ncs_gym.plants.family import Remainder
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.linearization import NoEquilibriumWarning, surrounding_shape
-from ncs_gym.uncertainty.remainder import Remainder
 from tests.certificates import certificate_of
 from tests.product import altered, gym_env, linear_model, safety_shield
 

@@ -9,8 +9,8 @@ from gymnasium.spaces import Box
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from ncs_gym import Channel, Ellipsoid, FunctionProcess, GymProcess
+from ncs_gym.plants.family import Remainder
 from ncs_gym.processes.process import LinearProcess, Process
-from ncs_gym.uncertainty.remainder import Remainder
 from tests.product import gym_env, gym_vector_env, linear_plant, loop_env, vector_env
 
 QUIET = {"sensor_bound": 0.0, "initial_bound": 0.0}

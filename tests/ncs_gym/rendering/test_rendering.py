@@ -21,7 +21,7 @@ from ncs_gym import Channel, Ellipsoid
 from ncs_gym.registration import ENVIRONMENTS, needing_extras
 from ncs_gym.rendering import Annotation, theme
 from ncs_gym.rendering.episode_record import PacketRecord
-from ncs_gym.rendering.phase_plane import PhasePlane
+from ncs_gym.rendering.renderer import PhasePlane
 from tests.plants import random_plant
 from tests.product import safety_shield
 

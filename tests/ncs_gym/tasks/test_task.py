@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, Disturbance, Regulation, SetpointTracking, SpeedTracking, Task, truck_trailer
-from ncs_gym.tasks.setpoint_tracking import farthest_equilibrium
+from ncs_gym.tasks import farthest_equilibrium
 from tests.product import linear_plant
 
 

@@ -6,8 +6,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from ncs_gym import Ellipsoid
 from ncs_gym.estimation.innovation import outside_sum
-from ncs_gym.uncertainty.ellipsoid import farthest_coordinates
-from ncs_gym.uncertainty.shape_matrices import is_inside, joined, outer_sum
+from ncs_gym.uncertainty.ellipsoid import farthest_coordinates, is_inside, joined, outer_sum
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 
 seeds = st.integers(0, 10_000)

@@ -14,7 +14,7 @@ from ncs_gym import (
     SinusoidDisturbance,
     truck_trailer,
 )
-from ncs_gym.plants.resting_point import MovedOperatingPointWarning
+from ncs_gym.limits import MovedOperatingPointWarning
 from tests.product import library_plant, linear_plant, loop_env, vector_env
 
 IN_M = AdversarialDisturbance(np.array([[2.0, 0.3], [0.3, 1.0]]))

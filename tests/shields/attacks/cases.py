@@ -19,7 +19,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.network.contract import contract_of
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from ncs_gym.processes.process import FamilyProcess, Process
 from shields import Certificate
 from tests.certificates import certificate_of

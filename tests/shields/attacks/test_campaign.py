@@ -33,7 +33,7 @@ from tests.shields.attacks.worlds import (
 )
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::ncs_gym.network.packet_reception.UnusedPacketsWarning", "ignore::ncs_gym.BrokenContractWarning"
+    "ignore::ncs_gym.network.channel.UnusedPacketsWarning", "ignore::ncs_gym.BrokenContractWarning"
 )
 
 MODES = ("project", "switch", "boundary", "lookahead")

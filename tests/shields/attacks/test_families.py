@@ -12,8 +12,8 @@ from scipy.linalg import expm
 
 from experiments.commands.attack import hostile_agents, starts, worst_case
 from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, Packet
+from ncs_gym.plants.family import Remainder
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
-from ncs_gym.uncertainty.remainder import Remainder
 from tests.certificates import certificate_of
 from tests.plants import varying_cart_pole, varying_truck
 from tests.product import altered, family_of, safe_loop, sampled_plant, vector_env, vector_shield

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid
-from ncs_gym.uncertainty.shape_matrices import outer_sum
+from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import SafetyFilter
 from shields.runtime.backup_plans import plan_search
 from tests.product import safety_filter

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 
 from ncs_gym import Channel, LinearPlant, contract_of
-from ncs_gym.plants.resting_point import MovedOperatingPointWarning
+from ncs_gym.limits import MovedOperatingPointWarning
 from shields import Certificate
 from tests.certificates import certificate_of
 from tests.product import linear_plant, sampled_plant

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.published import contract_of_plant, plant_of
 from ncs_gym import ChannelContract
 from ncs_gym.estimation.error_bound import certified_error_set
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from shields import Infeasible
 from shields.synthesis import polytope_certificates
 from shields.synthesis.invariant_polytope import share_in_polytope

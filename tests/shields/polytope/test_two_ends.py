@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 
 from benchmarks.published import channel_of, contract_of_plant, plant_of, published
 from ncs_gym import ChannelContract, contract_of
-from ncs_gym.plants.resting_point import MovedOperatingPointWarning
+from ncs_gym.limits import MovedOperatingPointWarning
 from shields import CertificateError, Infeasible
 from shields.synthesis.resting_point import farthest_equilibrium, improved
 from shields.synthesis.tolerance import most_tolerated

@@ -7,7 +7,7 @@ import pytest
 
 from ncs_gym import Channel, ChannelContract, cart_pole, truck_trailer
 from ncs_gym.network.gaussian_bound import bound_violation_probability
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from shields.runtime.guarantee import ALARM
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of

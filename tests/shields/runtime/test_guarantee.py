@@ -6,7 +6,7 @@ import pytest
 
 from ncs_gym import Channel, Packet
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
-from ncs_gym.uncertainty.shape_matrices import is_inside
+from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields import SafetyFilter, certificate_for
 from shields.runtime import Decision
 from shields.runtime import guarantee as proof

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Actuator, Channel, ChannelContract, Packet, cart_pole
-from ncs_gym.network.actuator import Command
+from ncs_gym.network.downlink import Command
 from shields.runtime.guarantee import (
     LATE_INPUT,
     NOT_CONFIRMED,

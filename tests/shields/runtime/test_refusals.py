@@ -23,7 +23,7 @@ from ncs_gym import (
 )
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.network.actuator import Command
+from ncs_gym.network.downlink import Command
 from shields import (
     CertificateError,
     SafeLoop,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess
-from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.plants.family import Remainder
 from shields import Infeasible
 from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE
 from shields.runtime.guard import GuaranteeMonitor

@@ -17,7 +17,7 @@ from ncs_gym import (
     cart_pole,
     truck_trailer,
 )
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from shields.runtime import guarantee
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of

@@ -10,7 +10,7 @@ from gymnasium.wrappers.vector import DictInfoToList
 
 from agents import SB3VecEnv
 from ncs_gym import Channel, Packet, RequestActions, VectorNetworked, VectorRequestActions, cart_pole, truck_trailer
-from ncs_gym.network.packet_reception import UnusedPacketsWarning
+from ncs_gym.network.channel import UnusedPacketsWarning
 from tests.certificates import certificate_of
 from tests.product import (
     linear_plant,

@@ -3,7 +3,7 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 from ncs_gym import ChannelContract, cart_pole, truck_trailer
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from ncs_gym.plants.lqr import regulator_gain
 from shields import Infeasible
 from shields.synthesis.design_problem import design_problem

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, LinearPlant
-from ncs_gym.uncertainty.remainder import Remainder
+from ncs_gym.plants.family import Remainder
 from shields import Certificate, CertificateError
 from shields.json_documents import document_of
 from shields.verification import require_valid

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import ChannelContract
-from ncs_gym.plants.batch_reactor import batch_reactor
+from ncs_gym.plants.library import batch_reactor
 from shields import Certificate, CertificateError
 from shields.json_documents import document_of, write_document
 from tests.certificates import certificate_of, with_proof
