@@ -5,9 +5,8 @@ of safety holds, for one loop, or for N, the last axis of all arrays; `safe_loop
 `wrapper` into environments.
 """
 
-from shields.runtime.decisions import Decision
 from shields.runtime.safe_loop import SafeLoop
-from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.safety_filter import Decision, SafetyFilter
 from shields.runtime.wrapper import SafetyShield, VectorSafetyShield
 
 __all__ = [

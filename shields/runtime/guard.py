@@ -15,7 +15,6 @@ from ncs_gym.network.contract import largest_age, warn_of_broken_contract
 from ncs_gym.network.downlink import IDEAL_DOWNLINK, CommittedInputs, DownlinkProtocol
 from ncs_gym.plants.hard_bounds import SIMULATED_REACH
 from ncs_gym.validation import CopiedWhole
-from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import (
     ALARM,
     CODES,
@@ -34,7 +33,7 @@ from shields.runtime.guarantee import (
     UNUSABLE,
     LostGuarantee,
 )
-from shields.runtime.safety_filter import MARGIN, MOST_REMEMBERED, SafetyFilter
+from shields.runtime.safety_filter import MARGIN, MOST_REMEMBERED, Decision, SafetyFilter
 from shields.runtime.set_test import FARTHEST, PredictedErrors, norms
 from shields.runtime.starts import StartKnown, first_store, known_inside, starts_known
 

@@ -29,10 +29,9 @@ from ncs_gym.validation import (
     warn_caller,
 )
 from shields.certificate import Certificate
-from shields.runtime.decisions import Decision
 from shields.runtime.guarantee import EXPLANATIONS, LATE_INPUT, NOT_CONFIRMED, OTHER_EPISODE, OTHER_INPUT
 from shields.runtime.guard import Guard
-from shields.runtime.safety_filter import SafetyFilter
+from shields.runtime.safety_filter import Decision, SafetyFilter
 
 NOT_STARTED = "no episode is under way: call start"
 

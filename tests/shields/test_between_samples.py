@@ -13,8 +13,8 @@ from ncs_gym import Channel, Packet, truck_trailer
 from ncs_gym.network.downlink import downlink_protocol
 from shields import Certificate, Infeasible, verify
 from shields.runtime.backup_plans import PlanTest, Prediction
-from shields.runtime.decisions import Decision
 from shields.runtime.guard import GuaranteeMonitor
+from shields.runtime.safety_filter import Decision
 from shields.runtime.set_test import ellipsoid_test
 from shields.runtime.starts import starts_known
 from tests.certificates import certificate_of

@@ -9,7 +9,7 @@ import numpy as np
 from ncs_gym.validation import as_numbers
 from shields.certificate import Fallback
 from shields.runtime.backup_plans.plan_search import Planner, Plans
-from shields.runtime.decisions import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
+from shields.runtime.safety_filter import INVALID, PLANNED, PROJECTED, SAFE, STORED, Decision
 from shields.runtime.set_test import PredictedErrors, ReachableSets, SetTest, norms
 
 

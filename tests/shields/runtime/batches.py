@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from shields import SafetyFilter
-from shields.runtime.decisions import Decision
+from shields.runtime.safety_filter import Decision
 
 
 def decided_alike(

@@ -15,8 +15,8 @@ from scipy.linalg import expm
 
 from ncs_gym import Channel, LinearPlant, Packet
 from ncs_gym.network.downlink import downlink_protocol
-from shields.runtime.decisions import Decision
 from shields.runtime.guard import GuaranteeMonitor
+from shields.runtime.safety_filter import Decision
 from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
 from tests.plants import swinging
