@@ -80,7 +80,7 @@ def campaign() -> list:
     return rows
 
 
-@pytest.mark.cases(18)
+@pytest.mark.cases(14)
 @pytest.mark.parametrize(("name", "mode", "through", "is_whole"), campaign())
 def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
     first = [*CASES].index(name) + MODES.index(mode)
@@ -281,7 +281,7 @@ def twins() -> list:
     ]
 
 
-@pytest.mark.cases(14)
+@pytest.mark.cases(10)
 @pytest.mark.parametrize(("defect", "name", "mode", "through"), twins())
 def test_the_adversary_catches(defect, name, mode, through, monkeypatch):
     claims, _, anyway, _ = TWINS[defect]
