@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.hard_bounds import INFLATION, SIMULATED_REACH
-from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH, LinearPlant
 from ncs_gym.uncertainty.ellipsoid import is_inside
 from ncs_gym.validation import ReadOnlyArrays
 

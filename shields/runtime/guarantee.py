@@ -10,7 +10,7 @@ import numpy as np
 from ncs_gym.envs.report import Belief
 from ncs_gym.network.contract import largest_age
 from ncs_gym.network.downlink import IDEAL_DOWNLINK, DownlinkProtocol
-from ncs_gym.plants.hard_bounds import SIMULATED_REACH
+from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.validation import shown, warn_caller
 from shields.errors import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.decisions import Decision

@@ -22,7 +22,7 @@ from ncs_gym.estimation.kalman_filter import (
 )
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.hard_bounds import FLAT_INFLATION
+from ncs_gym.plants.linear_plant import FLAT_INFLATION
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
 from tests.product import altered, library_plant, linear_plant, sampled_plant

@@ -9,7 +9,7 @@ from ncs_gym import Channel, ChannelContract, Ellipsoid
 from ncs_gym.estimation.error_sets import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import SetMembership
-from ncs_gym.plants.hard_bounds import INFLATION, SIMULATED_REACH
+from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
 from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields.verification.rational_matrix import congruence, rational
 from tests.product import altered, linear_plant
