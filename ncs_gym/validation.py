@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from operator import attrgetter
 from pathlib import PurePath
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -302,15 +302,36 @@ def as_count(value: Any, name: str, *, low: int, high: int = LARGEST_COUNT) -> i
     return int(value)
 
 
-def begun_many(shared: Any, rng: np.random.Generator, plant: Any, count: int) -> np.ndarray:
-    """Returns what `begin` of a task or a disturbance draws for `count` episodes, along the last axis."""
-    with storing_nothing(shared):
-        if shared.vectorized:
-            return shared.begin(rng, plant, count)
-        states = np.empty(count, dtype=object)
-        for episode in range(count):
-            states[episode] = shared.begin(rng, plant)
-        return states
+class Shared(ReadOnlyArrays):
+    """Base of tasks and disturbances: one object, which any number of environments share, and which stores nothing.
+
+    Attributes:
+        vectorized: Whether methods also take arrays whose last axis is the environment, `begin` with a `size`; a
+            subclass, which may override these, does not inherit it.
+    """
+
+    vectorized: ClassVar[bool] = False
+    _promises: ClassVar[tuple[str, ...]] = ("vectorized",)
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Takes promises about methods from a subclass."""
+        super().__init_subclass__(**keywords)
+        for name in cls._promises:
+            setattr(cls, name, vars(cls).get(name, False))
+
+    def begin(self, rng: np.random.Generator, plant: Any, size: int | None = None) -> Any:
+        """Returns what belongs to one episode, or to `size` of them along the last axis. Empty by default."""
+        return np.zeros((0,) if size is None else (0, size))
+
+    def begin_many(self, rng: np.random.Generator, plant: Any, count: int) -> np.ndarray:
+        """Returns `begin` for `count` episodes, along the last axis."""
+        with storing_nothing(self):
+            if self.vectorized:
+                return self.begin(rng, plant, count)
+            states = np.empty(count, dtype=object)
+            for episode in range(count):
+                states[episode] = self.begin(rng, plant)
+            return states
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from ncs_gym.envs.info import loop_info
 from ncs_gym.envs.loop import Loop, LoopState
 from ncs_gym.envs.report import Belief
 from ncs_gym.envs.spaces import actions_of
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.network.channel import Channel, require_on_request
 from ncs_gym.network.contract import ChannelContract, largest_age
 from ncs_gym.network.downlink import DownlinkProtocol, Inputs

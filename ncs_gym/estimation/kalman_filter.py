@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.plants.linear_plant import FLAT_INFLATION, INFLATION, LinearPlant
 from ncs_gym.uncertainty.ellipsoid import is_inside, outer_sum
 

@@ -23,12 +23,15 @@ from ncs_gym.networked.network_settings import (
     NetworkSettings,
     Predictor,
     ReadNetwork,
+    joined,
     network_rng,
+    quantized,
     require_action,
     require_no_network,
     require_no_restarts,
+    snapshot,
+    zero_of,
 )
-from ncs_gym.networked.observations import joined, quantized, snapshot, zero_of
 from ncs_gym.validation import AroundEnvironments, require_batched_infos, shown
 
 

@@ -23,8 +23,15 @@ from ncs_gym.bounds import DELTA, Ball, Bounds, Sum, pushes_of
 from ncs_gym.limits import Limits, LimitValues, reach_in_steps, weight_of
 from ncs_gym.model import Model
 from ncs_gym.reading import json_values, read_text
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, document_of, ellipsoid_around_sum, outer_sum, read_back
-from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
+from ncs_gym.uncertainty.ellipsoid import (
+    Ellipsoid,
+    TruncatedGaussian,
+    document_of,
+    ellipsoid_around_sum,
+    outer_sum,
+    read_back,
+    truncation_energy,
+)
 from ncs_gym.validation import as_names, counted, read_only, reason_of, setting, shown
 
 # Relative growth of every hard bound for the rounding of sampling and quantizing (docs/shield_proof.md), and of its

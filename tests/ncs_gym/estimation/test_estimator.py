@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from benchmarks.networks import KINDS, gains_taken
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truck_trailer
 from ncs_gym.estimation.arrival_histories import histories_of
-from ncs_gym.estimation.error_bound import certified_error_set
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.innovation import quick_test
 from ncs_gym.estimation.kalman_filter import (
@@ -134,7 +133,7 @@ CHANNELS = [
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
 def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, seed):
     plant = random_plant(seed, 2 + seed % 3, 1, p=1 + seed % 2) if seed else truck_trailer(mass=4000.0)
 

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from ncs_gym import truck_trailer
 from ncs_gym.plants.library import convoy, lane_keeping, stirred_tank
-from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
+from ncs_gym.uncertainty.ellipsoid import TruncatedGaussian, truncation_energy
 from tests.product import altered, library_plant
 
 BOUNDS = ("disturbance_bound", "sensor_bound", "initial_bound")
