@@ -264,7 +264,9 @@ class SetpointTracking(Task):
     def check(self, plant):  # noqa: D102
         if self.output.shape != (plant.n,):
             return f"output must have shape ({plant.n},), got {self.output.shape}"
-        farthest = _farthest(self, plant)
+        if _smallest_equilibria_hold(plant, self.output, self.reach):
+            return ""
+        farthest = farthest_equilibrium(plant, self.output)
         if self.reach > farthest * (1.0 + _ROUNDING):
             return (
                 f"targets reach {self.reach:g}, but the farthest equilibrium inside the safe box and the input limits "
@@ -282,9 +284,23 @@ class SetpointTracking(Task):
         return np.where(chance < self.change_probability, self.reach * (2.0 * drawn - 1.0), target)[()]
 
 
-@lru_cache(maxsize=64)
-def _farthest(task: SetpointTracking, plant: LinearPlant) -> float:
-    return farthest_equilibrium(plant, task.output)
+def _smallest_equilibria_hold(plant: LinearPlant, output: np.ndarray, reach: float) -> bool:
+    """Returns whether the smallest states and inputs at rest with c x = +-reach are within the limits.
+
+    That is enough, and takes no linear program.
+    """
+    scale = np.concatenate([plant.half_widths, plant.input_half])
+    balance = np.hstack([np.eye(plant.n) - plant.A, -plant.B]) / plant.half_widths[:, None]
+    rows = np.vstack([balance, np.concatenate([output, np.zeros(plant.m)])]) * scale
+    wanted = np.concatenate([np.zeros(plant.n), [reach]])
+    smallest = np.linalg.lstsq(rows, wanted)[0]
+    if not np.abs(rows @ smallest - wanted).max() <= _ROUNDING * reach:
+        return False
+    (x, u), (low, high) = np.split(scale * smallest, [plant.n]), plant.input_ends
+    return all(
+        (plant.constraint_values(sign * x) <= 0.0).all() and (low <= sign * u).all() and (sign * u <= high).all()
+        for sign in (1.0, -1.0)
+    )
 
 
 def farthest_equilibrium(plant: LinearPlant, output: np.ndarray) -> float:
@@ -306,7 +322,7 @@ def farthest_equilibrium(plant: LinearPlant, output: np.ndarray) -> float:
             b_eq=np.zeros(n),
             bounds=[(None, None)] * n + list(zip(low, high, strict=True)),
         )
-        farthest = min(farthest, np.inf if found.status else -float(found.fun))  # without a limit, or not solved
+        farthest = min(farthest, np.inf if found.status == 3 else -float(found.fun))
     return farthest
 
 
