@@ -77,11 +77,6 @@ class ErrorSet(ReadOnlyArrays):
         """That of the largest age that is promised, shape (n, n)."""
         return self.promised[-1]
 
-    @property
-    def rate(self) -> float:
-        """The rate of the largest age that is promised."""
-        return float(self.rates[-1])
-
     def shape_at(self, age: int) -> np.ndarray | None:
         """Returns the certified shape, (n, n), for a newest sample `age` steps old; None beyond the contract."""
         if self.contract is None:

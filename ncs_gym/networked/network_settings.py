@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import seeding
+from gymnasium.utils import RecordConstructorArgs, seeding
 from gymnasium.wrappers import Autoreset
 
 from ncs_gym.envs.episode_channels import EpisodeChannels
@@ -345,8 +346,8 @@ class NetworkSettings:
         return max(max(ages) + downlink_protocol(self.downlink, None).input_delay, 1)
 
 
-class ReadNetwork:
-    """Mixin of the wrappers: what they are made with is read, and never set; and what the network draws from."""
+class ReadNetwork(RecordConstructorArgs, ABC):
+    """Base of the wrappers: what they are made with is read, and never set; and what the network draws from."""
 
     channel: Any = setting("channel", "_settings.channel")
     downlink: Channel | None = setting("downlink", "_settings.downlink")
@@ -355,6 +356,26 @@ class ReadNetwork:
 
     _settings: NetworkSettings
     _rng: np.random.Generator | None = None
+
+    def __init__(
+        self,
+        env: Any,
+        channel: Channel | Mapping[str, Any] | tuple[Any, ...] | None = None,
+        downlink: Channel | Mapping[str, Any] | None = None,
+        observe: Sequence[str] = (),
+        fill: str | Predictor = "last",
+        idle: str = "hold",
+        neutral: Any = None,
+        pending: int | None = None,
+    ) -> None:
+        given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "idle": idle}
+        self._wrap(env, given | {"neutral": neutral, "pending": pending})
+        require_no_restarts(env)
+        RecordConstructorArgs.__init__(self, **self._settings.recorded)
+
+    @abstractmethod
+    def _wrap(self, env: Any, given: dict[str, Any]) -> None:
+        """Sets up the wrapper around an environment, with `_settings`; raises ValueError if it does not fit."""
 
     @property
     def np_random(self) -> np.random.Generator:

@@ -33,7 +33,7 @@ FINE = {"covariance_bits": 45, "shape_step": 2.0**-45}
 def roomy(plant, factor=1e4):
     """An error set so large that the guard accepts every Kalman update."""
     errors = certified_error_set(plant)
-    return ErrorSet(shapes=np.array([factor * errors.Sigma]), rates=np.array([errors.rate]))
+    return ErrorSet(shapes=np.array([factor * errors.Sigma]), rates=np.array([errors.rates[-1]]))
 
 
 def sets_of(plant, channel=None):
