@@ -20,16 +20,6 @@ def test_truck_trailer_reproduces_the_printed_matrices():
     np.testing.assert_allclose(plant.B, [[0.0612], [0.1636]], atol=5e-5)
 
 
-def test_disturbance_bound_holds_ball_plus_truncated_noise():
-    plant = truck_trailer()
-    rng = np.random.default_rng(0)
-    for _ in range(500):
-        direction = rng.standard_normal(2)
-        direction /= np.linalg.norm(direction)
-        need = np.sqrt(plant.gamma) + np.sqrt(chi2.ppf(0.95, 2) * direction @ plant.process_noise_cov @ direction)
-        assert plant.disturbance.support(direction) >= need
-
-
 def test_sensor_bound_with_quantizer_holds_corners_of_the_rounding_box():
     plant = truck_trailer()
     step = 0.05
