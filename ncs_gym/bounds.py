@@ -14,8 +14,14 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, UncertainSet, ellipsoid_around_sum
-from ncs_gym.uncertainty.truncated_gaussian import SMALLEST_DELTA, SMALLEST_KEPT, truncation_energy
+from ncs_gym.uncertainty.ellipsoid import (
+    SMALLEST_DELTA,
+    SMALLEST_KEPT,
+    Ellipsoid,
+    UncertainSet,
+    ellipsoid_around_sum,
+    truncation_energy,
+)
 from ncs_gym.validation import ReadOnlyArrays, as_covariance, as_matrix, as_number, as_setting, shown
 
 # Sizes are squared, and must not become zero or infinite by that.

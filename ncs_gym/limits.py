@@ -315,7 +315,7 @@ def reach_in_steps(A: np.ndarray, B: np.ndarray, largest_input: np.ndarray, reac
 def weight_of(rows: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Returns positive definite W, shape (n, n): C'C of rows c_j, (k, n), regularized by the reach of states in no row.
 
-    That is `HardBounds.reach_from_rest`, shape (n,), in which 0 stands for 1.
+    That is `LinearPlant.reach_from_rest`, shape (n,), in which 0 stands for 1.
     """
     gram = exact.product(rows.T, rows)
     squares, sizes = np.diag(gram), FREE_REACH * np.where(reach > 0.0, reach, 1.0)

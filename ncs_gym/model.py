@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -63,6 +62,7 @@ class Model(ReadOnlyArrays):
         continuous: [Ac, Bc] of x' = Ac x + Bc u that A and B were sampled from, shape (n, n + m); None if unknown.
         delays: Steps after which each input acts on each state, shape (n, m) (`with_delays`).
         state, input: `at`, zero where it is None.
+        lacking: What `at` lacks of an equilibrium beside an offset, which is rounding, shape (n,).
 
     Raises:
         ValueError: If a matrix has a wrong shape or is not finite, `at` is no equilibrium beside an offset, or A and B
@@ -79,6 +79,7 @@ class Model(ReadOnlyArrays):
     delays: Any = 0
     state: np.ndarray = field(init=False, repr=False)
     input: np.ndarray = field(init=False, repr=False)
+    lacking: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         A = _square(self.A)
@@ -97,24 +98,19 @@ class Model(ReadOnlyArrays):
         self._set(at=as_given(self.at), A=A, B=B, H=H, dt=dt, delays=delays)
         if self.offset is not None:
             self._set(offset=as_vector(self.offset, n, "offset"))
-        _ = self.lacking  # which refuses a point that is no equilibrium
+        lacking = np.zeros(n)
+        if self.offset is not None:
+            lacking, rests = residual(A, B, np.eye(n), self.state, self.input, self.offset)
+            if not rests:
+                text = f"A x0 + B u0 + c - x0 = {shown(lacking.tolist())}; a model of deviations has no offset"
+                raise ValueError(f"the operating point is no equilibrium: {text}")
+        self._set(lacking=lacking)
         if self.continuous is not None:
             continuous = as_matrix(self.continuous, (n, n + B.shape[1]), "continuous")
             sampled = zero_order_hold(continuous[:, :n], continuous[:, n:], dt)
             if not (np.array_equal(sampled[0], A) and np.array_equal(sampled[1], B)):
                 raise ValueError("continuous must be what A and B were sampled from, as by Model.sampled, or None")
             self._set(continuous=continuous)
-
-    @cached_property
-    def lacking(self) -> np.ndarray:
-        """What `at` lacks of an equilibrium beside an offset, shape (n,); raises ValueError if it is not rounding."""
-        if self.offset is None:
-            return np.zeros(len(self.A))
-        missing, rests = residual(self.A, self.B, np.eye(len(self.A)), self.state, self.input, self.offset)
-        if not rests:
-            lacking = f"A x0 + B u0 + c - x0 = {shown(missing.tolist())}"
-            raise ValueError(f"the operating point is no equilibrium: {lacking}; a model of deviations has no offset")
-        return missing
 
     @classmethod
     def sampled(cls, A: Any, B: Any, C: Any, dt: float, at: Any = None) -> Self:

@@ -112,15 +112,13 @@ class Factory:
             read, own["contract"] = _made(self.plant), self.contract or contract_of(self.channel)
         if between_samples is not None:
             read = replace(read, limits=replace(read.limits, between_samples=between_samples))
-        own |= {"plant": read, "disturbance": self._disturbance(read)}
+        fits = isinstance(read, LinearPlant) and not self.disturbance.check(read)
+        own |= {"plant": read, "disturbance": self.disturbance if fits else "ball"}
         if self.start is not None and getattr(read, "n", 0) == 2:
             own["initial_set"] = Ellipsoid(self.start**2 * np.eye(2))
         for name, value in given.items():
-            if name in kinds or name == "terminate_on_violation":
-                if value is not None:
-                    own[name] = from_json(value, kinds[name], name) if name in kinds else value
-            else:
-                own[name] = value
+            if value is not None or name not in (*kinds, "terminate_on_violation"):
+                own[name] = from_json(value, kinds[name], name) if name in kinds else value
         return own
 
     @property
@@ -132,12 +130,6 @@ class Factory:
     def is_installed(self) -> bool:
         """Whether what the process needs is installed."""
         return not self.extra or find_spec(self.extra) is not None
-
-    def _disturbance(self, plant: Any) -> Any:
-        own = self.disturbance
-        if not isinstance(plant, LinearPlant) or own.check(plant):
-            return "ball"
-        return own
 
 
 @cache

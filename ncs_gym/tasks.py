@@ -13,39 +13,23 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import (
-    ReadOnlyArrays,
+    Shared,
     as_count,
     as_covariance,
     as_number,
     as_vector,
-    begun_many,
     guarded,
     shown,
     storing_nothing,
 )
 
 
-class Task(ReadOnlyArrays, ABC):
+class Task(Shared, ABC):
     """A reward, and perfectly known extra entries of the observation.
 
     `begin` draws the task's state for an episode, `advance` moves it one step; neither stores anything in the object,
-    which any number of environments share.
-
-    Attributes:
-        vectorized: Whether the methods also take arrays whose last axis is the environment, `begin` with a `size`; a
-            subclass does not inherit it.
+    which any number of environments share (`vectorized` says whether methods take many at once).
     """
-
-    vectorized: ClassVar[bool] = False
-
-    def __init_subclass__(cls, **keywords: Any) -> None:
-        """Takes a promise about methods from a subclass, which may override these."""
-        super().__init_subclass__(**keywords)
-        cls.vectorized = vars(cls).get("vectorized", False)
-
-    def begin(self, rng: np.random.Generator, plant: LinearPlant, size: int | None = None) -> Any:
-        """Returns the task's state at the start of an episode; last axis `size` if vectorized. Empty by default."""
-        return np.zeros((0,) if size is None else (0, size))
 
     def advance(self, rng: np.random.Generator, plant: LinearPlant, task_state: Any, u: np.ndarray) -> Any:
         """Returns the task's state after input u, shape (m,) or (m, N), was applied for one step."""
@@ -76,10 +60,6 @@ class Task(ReadOnlyArrays, ABC):
             state: True state at the end of the step, shape (n,) or (n, N).
             u: Input that was applied, shape (m,) or (m, N).
         """
-
-    def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
-        """Returns the task states of `count` episodes along the last axis."""
-        return begun_many(self, rng, plant, count)
 
     def advance_many(
         self, rng: np.random.Generator, plant: LinearPlant, task_state: np.ndarray, u: np.ndarray

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from operator import attrgetter
 from pathlib import PurePath
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -242,26 +242,17 @@ def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
     return matrix + COVARIANCE_ROUNDING * np.diag(variances) if smallest < -EIGENVALUE_ROUNDING else matrix
 
 
-def as_number(
-    value: Any,
-    name: str,
-    *,
-    low: float = -np.inf,
-    high: float = np.inf,
-    low_open: bool = False,
-    high_open: bool = False,
-) -> float:
+def as_number(value: Any, name: str, *, low: float = -np.inf, high: float = np.inf, low_open: bool = False) -> float:
     """Returns `value` as a finite float inside an interval, or raises ValueError."""
     wanted = f"{'>' if low_open else '>='} {low:g}" if np.isfinite(low) else "finite"
-    wanted += f" and {'<' if high_open else '<='} {high:g}" if np.isfinite(high) else ""
+    wanted += f" and <= {high:g}" if np.isfinite(high) else ""
     try:
         single = as_setting(float(value) if type(value) is int else value)  # numpy knows no longer ones
     except OverflowError:
         single = None
     number = np.nan if single is None or single.ndim else float(single)
     above = number > low if low_open else number >= low
-    below = number < high if high_open else number <= high
-    if not (np.isfinite(number) and above and below):
+    if not (np.isfinite(number) and above and number <= high):
         raise ValueError(f"{name} must be a number {wanted}, got {shown(value)}")
     bounded = np.isfinite(low) and np.isfinite(high)
     if not (bounded or number == 0.0 or SMALLEST_NUMBER <= abs(number) < LARGEST_NUMBER):
@@ -302,15 +293,36 @@ def as_count(value: Any, name: str, *, low: int, high: int = LARGEST_COUNT) -> i
     return int(value)
 
 
-def begun_many(shared: Any, rng: np.random.Generator, plant: Any, count: int) -> np.ndarray:
-    """Returns what `begin` of a task or a disturbance draws for `count` episodes, along the last axis."""
-    with storing_nothing(shared):
-        if shared.vectorized:
-            return shared.begin(rng, plant, count)
-        states = np.empty(count, dtype=object)
-        for episode in range(count):
-            states[episode] = shared.begin(rng, plant)
-        return states
+class Shared(ReadOnlyArrays):
+    """Base of tasks and disturbances: one object, which any number of environments share, and which stores nothing.
+
+    Attributes:
+        vectorized: Whether methods also take arrays whose last axis is the environment, `begin` with a `size`; a
+            subclass, which may override these, does not inherit it.
+    """
+
+    vectorized: ClassVar[bool] = False
+    _promises: ClassVar[tuple[str, ...]] = ("vectorized",)
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        """Takes promises about methods from a subclass."""
+        super().__init_subclass__(**keywords)
+        for name in cls._promises:
+            setattr(cls, name, vars(cls).get(name, False))
+
+    def begin(self, rng: np.random.Generator, plant: Any, size: int | None = None) -> Any:
+        """Returns what belongs to one episode, or to `size` of them along the last axis. Empty by default."""
+        return np.zeros((0,) if size is None else (0, size))
+
+    def begin_many(self, rng: np.random.Generator, plant: Any, count: int) -> np.ndarray:
+        """Returns `begin` for `count` episodes, along the last axis."""
+        with storing_nothing(self):
+            if self.vectorized:
+                return self.begin(rng, plant, count)
+            states = np.empty(count, dtype=object)
+            for episode in range(count):
+                states[episode] = self.begin(rng, plant)
+            return states
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import numpy as np
 from ncs_gym.envs.belief import Belief
 from ncs_gym.envs.episode_channels import EpisodeChannels
 from ncs_gym.envs.loop import Loop, LoopState
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.network.channel import Channel, require_on_request
 from ncs_gym.network.contract import ChannelContract, largest_age
 from ncs_gym.network.downlink import DownlinkProtocol

@@ -14,7 +14,7 @@ from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.loop_settings import expect, loop_contracts, starting_set
 from ncs_gym.envs.spaces import nearest_action
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator, VectorEstimator
 from ncs_gym.network.channel import Channel, UnusedPacketsWarning
 from ncs_gym.network.contract import ChannelContract, largest_age

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from ncs_gym.envs.belief import Belief
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid

@@ -1,7 +1,6 @@
 """The delay-aware Kalman filter and the ellipsoids that its error never leaves (set-membership estimation)."""
 
-from ncs_gym.estimation.error_bound import ErrorSetError, UnstablePlantError, certified_error_set
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet, ErrorSetError, UnstablePlantError, certified_error_set
 from ncs_gym.estimation.estimator import Estimator, VectorEstimator
 
 __all__ = [

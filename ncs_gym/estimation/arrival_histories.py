@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.estimation.error_bound import certified_error_set
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
 from ncs_gym.estimation.innovation import common_axes, quick_test
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.network.channel import Channel

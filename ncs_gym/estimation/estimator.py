@@ -19,8 +19,7 @@ from ncs_gym.estimation.arrival_histories import (
     arrival_histories,
     histories_of,
 )
-from ncs_gym.estimation.error_bound import require_error_set
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
 from ncs_gym.estimation.innovation import ALARM_TOLERANCE, outside_sum, outside_sum_in_axes
 from ncs_gym.network.channel import Channel, Packet
 from ncs_gym.plants.linear_plant import LinearPlant

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ncs_gym.plants.hard_bounds import FLAT_INFLATION
+from ncs_gym.plants.linear_plant import FLAT_INFLATION
 
 # An innovation this far beyond its exact bound counts as rounding, not as an alarm.
 ALARM_TOLERANCE = 1e-9

@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.plants.hard_bounds import FLAT_INFLATION, INFLATION
-from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.plants.linear_plant import FLAT_INFLATION, INFLATION, LinearPlant
 from ncs_gym.uncertainty.ellipsoid import is_inside, outer_sum
 
 # Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `enlarged_by_rounding`).

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -11,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
-from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
@@ -21,18 +19,19 @@ from ncs_gym.network.channel import Channel
 from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
 from ncs_gym.networked.network_settings import (
     NetworkSettings,
-    Predictor,
     ReadNetwork,
+    joined,
     network_rng,
+    quantized,
     require_action,
     require_no_network,
-    require_no_restarts,
+    snapshot,
+    zero_of,
 )
-from ncs_gym.networked.observations import joined, quantized, snapshot, zero_of
 from ncs_gym.validation import AroundEnvironments, require_batched_infos, shown
 
 
-class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
+class Networked(ReadNetwork, gym.Wrapper):
     """Puts a network between an environment and its agent: observations and actions are late, lost, rare or rounded.
 
     It needs no model and proves nothing; where there is a linear model, `NCSEnv` has an estimator and a shield for it.
@@ -92,26 +91,12 @@ class Networked(ReadNetwork, gym.Wrapper, RecordConstructorArgs):
         ValueError: If a setting is wrong, or does not fit the environment's spaces.
     """
 
-    def __init__(
-        self,
-        env: gym.Env,
-        channel: Channel | Mapping[str, Any] | tuple[Any, ...] | None = None,
-        downlink: Channel | Mapping[str, Any] | None = None,
-        observe: Sequence[str] = (),
-        fill: str | Predictor = "last",
-        idle: str = "hold",
-        neutral: Any = None,
-        pending: int | None = None,
-    ) -> None:
-        given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "idle": idle}
-        given |= {"neutral": neutral, "pending": pending}
+    def _wrap(self, env: gym.Env, given: dict[str, Any]) -> None:
         if not isinstance(env, gym.Env):
             raise ValueError(f"Networked takes an environment, as gym.make returns it, got {shown(env)}")
         if isinstance(env.unwrapped, NCSEnv):
             raise ValueError("an NCSEnv has its own network: give gym.make(id, channel=..., downlink=...)")
-        require_no_restarts(env)
         self._settings = settings = NetworkSettings(env.observation_space, env.action_space, given)
-        RecordConstructorArgs.__init__(self, **settings.recorded)
         gym.Wrapper.__init__(self, env)
         self.observation_space = settings.entries.space
         self._links = settings.links(1)
@@ -266,7 +251,7 @@ def nothing(actions: gym.Space) -> Any:
 _ARRAYS = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
 
 
-class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordConstructorArgs):
+class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper):
     """Puts a network between N environments and their agent; see `Networked`, also for the arguments.
 
     Observations and actions are one array each. Every environment has a network of its own; all draw from one
@@ -293,24 +278,11 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
         ValueError: If a setting is wrong, or does not fit the environments' spaces.
     """
 
-    def __init__(
-        self,
-        env: VectorEnv,
-        channel: Channel | Mapping[str, Any] | None = None,
-        downlink: Channel | Mapping[str, Any] | None = None,
-        observe: Sequence[str] = (),
-        fill: str | Predictor = "last",
-        idle: str = "hold",
-        neutral: Any = None,
-        pending: int | None = None,
-    ) -> None:
-        given = {"channel": channel, "downlink": downlink, "observe": observe, "fill": fill, "idle": idle}
-        given |= {"neutral": neutral, "pending": pending}
+    def _wrap(self, env: VectorEnv, given: dict[str, Any]) -> None:
         if not isinstance(env, VectorEnv):
             raise ValueError(f"VectorNetworked takes vector environments, as gym.make_vec returns, got {shown(env)}")
         if isinstance(env.unwrapped, NCSVectorEnv):
             raise ValueError("expected a vector environment without a network of its own: an NCSVectorEnv has one")
-        require_no_restarts(env)
         self._settings = settings = NetworkSettings(env.single_observation_space, env.single_action_space, given)
         for name, space in (("observations", settings.entries.space), ("actions", env.single_action_space)):
             if not isinstance(space, _ARRAYS):
@@ -318,7 +290,6 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper, RecordCons
                     f"VectorNetworked takes {name} that are one array, not {shown(space)}: put Networked around each "
                     "environment"
                 )
-        RecordConstructorArgs.__init__(self, **settings.recorded)
         VectorWrapper.__init__(self, env)
         self.single_observation_space = settings.entries.space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)

@@ -10,8 +10,8 @@ import numpy as np
 
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
-from ncs_gym.rendering.canvas import Canvas
 from ncs_gym.rendering.episode_record import RECENT_STEPS, Annotation, ConvexSet, EpisodeRecord, TrackedOutput
+from ncs_gym.rendering.theme import Canvas
 from ncs_gym.tasks import Task
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import counted

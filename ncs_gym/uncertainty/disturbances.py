@@ -18,13 +18,12 @@ from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import (
     LARGEST_NUMBER,
-    ReadOnlyArrays,
+    Shared,
     as_covariance,
     as_matrix,
     as_number,
     as_setting,
     as_vector,
-    begun_many,
     shown,
     storing_nothing,
 )
@@ -37,7 +36,7 @@ TOLERANCE = 1e-9
 NOISES = ("truncated", "gaussian", "extreme")
 
 
-class Disturbance(ReadOnlyArrays, ABC):
+class Disturbance(Shared, ABC):
     """A disturbance in the ball d'd <= `gamma` of a plant plus its `disturbance_bound`; process noise is added to it.
 
     `begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores anything in the
@@ -45,24 +44,13 @@ class Disturbance(ReadOnlyArrays, ABC):
 
     Attributes:
         replaces_process_noise: Whether the whole of E(D) is used, process noise included.
-        vectorized: Whether the methods also take arrays whose last axis is the environment.
         memoryless: Whether d depends on chance alone; `draw` is then called ahead, with an array of the right shape in
             place of A x + B u, and None for step and memory.
     """
 
     replaces_process_noise: ClassVar[bool] = False
-    vectorized: ClassVar[bool] = False
     memoryless: ClassVar[bool] = False
-
-    def __init_subclass__(cls, **keywords: Any) -> None:
-        """Takes promises about methods from a subclass, which may override these."""
-        super().__init_subclass__(**keywords)
-        for name in ("vectorized", "memoryless", "replaces_process_noise"):
-            setattr(cls, name, vars(cls).get(name, False))
-
-    def begin(self, rng: np.random.Generator, plant: LinearPlant, size: int | None = None) -> Any:
-        """Returns what stays fixed for one episode; last axis `size` if vectorized. Nothing by default."""
-        return np.zeros((0,) if size is None else (0, size))
+    _promises = "vectorized", "memoryless", "replaces_process_noise"
 
     @abstractmethod
     def draw(
@@ -77,10 +65,6 @@ class Disturbance(ReadOnlyArrays, ABC):
             step: Number of steps taken before this one, an int or shape (N,).
             memory: What `begin` returned.
         """
-
-    def begin_many(self, rng: np.random.Generator, plant: LinearPlant, count: int) -> np.ndarray:
-        """Returns the memories of `count` episodes along the last axis."""
-        return begun_many(self, rng, plant, count)
 
     def draw_many(
         self, rng: np.random.Generator, plant: LinearPlant, nominal_next: np.ndarray, steps: np.ndarray, memory: Any

@@ -11,9 +11,8 @@ from typing import Self
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.estimation.error_bound import require_error_set
-from ncs_gym.estimation.error_sets import ErrorSet
-from ncs_gym.plants.hard_bounds import SIMULATED_REACH
+from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
+from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.validation import ReadOnlyArrays
 from shields.certificate import Certificate, CertificateError, Updates
 from shields.runtime.safety_filter import MARGIN, SafetyFilter

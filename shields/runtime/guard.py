@@ -13,7 +13,7 @@ from ncs_gym.envs.belief import Belief
 from ncs_gym.estimation.arrival_histories import ErrorTable
 from ncs_gym.network.contract import largest_age, warn_of_broken_contract
 from ncs_gym.network.downlink import IDEAL_DOWNLINK, CommittedInputs, DownlinkProtocol
-from ncs_gym.plants.hard_bounds import SIMULATED_REACH
+from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.validation import CopiedWhole
 from shields.runtime.guarantee import (
     ALARM,

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import ChannelContract, ErrorSetError, LinearPlant, UnstablePlantError, exact
-from ncs_gym.estimation.error_bound import certified_error_set
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
 from ncs_gym.plants.linear_plant import GridRows
 from ncs_gym.uncertainty.ellipsoid import is_inside, joined
 from shields.errors import Infeasible

@@ -107,7 +107,7 @@ def test_packet_log_that_expands_is_refused(kind, write):
         PacketLog.load(write("log.csv", LOGS[kind]))
 
 
-@pytest.mark.parametrize(("gap", "dt"), [(1e9, 0.01), (1e300, 1e-3), (1e6, 0.01)])
+@pytest.mark.parametrize(("gap", "dt"), [(1e9, 0.01), (4e9, 1e-3), (1e6, 0.01)])
 def test_packets_that_are_far_apart_have_no_ages(gap, dt):
     log = PacketLog([0.0, gap, 2 * gap], [0.1, 0.0, 0.0])
     for expand in (log.ages, log.channel, log.trace, log.send_period):

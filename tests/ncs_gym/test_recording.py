@@ -56,7 +56,7 @@ def case_of(name):
 @pytest.mark.parametrize("name", PLANTS)
 def test_what_acted_lies_between_the_bounds_within_a_factor_of_two_where_states_are_measured(name):
     model, E, half, phi = case_of(name)
-    u, y, s = driven(model, 400, half, phi, E=E)
+    u, y, s = driven(model, 250, half, phi, E=E)
     found, acted = bounds_from_recording(model, u, y, E, sensor=phi), np.abs(s).max(axis=0)
     assert (0.5 * acted <= found.lower).all()
     assert (found.lower <= acted).all()
@@ -93,7 +93,7 @@ def oracle(model, u, y, E=None):
 
 def test_outputs_alone_bound_disturbances_along_few_directions():
     model = library_plant(batch_reactor).model
-    u, y, s = driven(model, 300, np.array([0.01, 0.02]), 1e-5, E=model.B)
+    u, y, s = driven(model, 200, np.array([0.01, 0.02]), 1e-5, E=model.B)
     found = bounds_from_recording(model, u, y, model.B, sensor=1e-5)
     inner = np.abs(s[found.window : -found.window]).max(axis=0)
     assert found.window > 1

@@ -10,7 +10,7 @@ import numpy as np
 from flint import arb, ctx, fmpq
 
 from ncs_gym import Ellipsoid, LinearPlant
-from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian
+from ncs_gym.uncertainty.ellipsoid import TruncatedGaussian
 from shields.certificate import Certificate
 from shields.verification.condition import Condition
 from tests.second_verifier.exact import PRECISION, at_least_zero, definite, identity, is_so, matrix, number

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from benchmarks.networks import KINDS, gains_taken
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truck_trailer
 from ncs_gym.estimation.arrival_histories import histories_of
-from ncs_gym.estimation.error_bound import certified_error_set
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.innovation import quick_test
 from ncs_gym.estimation.kalman_filter import (
@@ -22,7 +21,7 @@ from ncs_gym.estimation.kalman_filter import (
 )
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.hard_bounds import FLAT_INFLATION
+from ncs_gym.plants.linear_plant import FLAT_INFLATION
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
 from tests.product import altered, library_plant, linear_plant, sampled_plant
@@ -34,7 +33,7 @@ FINE = {"covariance_bits": 45, "shape_step": 2.0**-45}
 def roomy(plant, factor=1e4):
     """An error set so large that the guard accepts every Kalman update."""
     errors = certified_error_set(plant)
-    return ErrorSet(shapes=np.array([factor * errors.Sigma]), rates=np.array([errors.rate]))
+    return ErrorSet(shapes=np.array([factor * errors.Sigma]), rates=np.array([errors.rates[-1]]))
 
 
 def sets_of(plant, channel=None):
@@ -134,7 +133,7 @@ CHANNELS = [
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
 def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, seed):
     plant = random_plant(seed, 2 + seed % 3, 1, p=1 + seed % 2) if seed else truck_trailer(mass=4000.0)
 

@@ -94,7 +94,7 @@ UNSTABLE = plants(most_states=3, radius=(0.9, 1.3), units=1.0), st.integers(0, 6
 
 
 @pytest.mark.cases(1)
-@pytest.mark.parametrize("count", [8, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [4, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("of", "age"), [STABLE, UNSTABLE], ids=["stable", "unstable"])
 def test_estimator_equals_the_plain_one_bit_for_bit(of, age, count):
     @given(plant=of, channel=channels(), age=age, seed=st.integers(0, 2**32 - 1))

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid
-from ncs_gym.estimation.error_sets import ErrorSet
+from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import SetMembership
-from ncs_gym.plants.hard_bounds import INFLATION, SIMULATED_REACH
+from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
 from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields.verification.rational_matrix import congruence, rational
 from tests.product import altered, linear_plant
@@ -74,7 +74,7 @@ def largest_gauge_after_an_update(plant, error_set):
     """How far out of E(Sigma_0) updates in float64 take errors, 1 is its boundary, with error and noise at theirs."""
     error, noise = (Fraction(float(shape[0, 0]) ** 0.5) for shape in (error_set.shapes[1], error_set.noise))
     largest, rng = 0.0, np.random.default_rng(0)
-    for _ in range(500):
+    for _ in range(250):
         estimate = SIMULATED_REACH * plant.half_widths[0] * rng.uniform(0.7, 1.0)
         sample = estimate - float(error - noise)
         state = max(Fraction(estimate) - error, Fraction(sample) - noise)  # error and noise are within their bounds
@@ -107,7 +107,7 @@ def test_a_gain_chosen_at_run_time_has_the_room_where_shapes_are_hardly_rounded_
     sets = SetMembership(plant, 0.0, UNIT, shape_step=2.0**-90)
     error, noise = Fraction(radius), Fraction(float(sets.noise[0, 0] ** 0.5)) * (1 - Fraction(1, 10**15))
     limit = sets.updated(np.array([[radius**2]]), np.array([[gain]])).item() ** 0.5
-    for _ in range(500):
+    for _ in range(250):
         estimate = SIMULATED_REACH * rng.uniform(0.7, 1.0)
         sample = float(Fraction(H) * (Fraction(estimate) - error) + noise)
         state = max(
@@ -174,7 +174,7 @@ def test_room_grows_with_the_gain_and_sets_without_it_are_refused():
     assert is_inside(updated + plant.estimate_rounding, sets.shapes[0])  # with the room of small gains (C2) holds
     # In exact arithmetic: float64 moves an update of an estimate far out by more than that room is for.
     rng, moved = np.random.default_rng(0), 0.0
-    for _ in range(300):
+    for _ in range(150):
         estimate = np.array([SIMULATED_REACH * rng.uniform(0.6, 0.97)])
         sample = plant.H @ estimate + 1e-4 * rng.uniform(0.9, 1.1, 2)
         moved = max(moved, rounded_away(gain, plant.H, estimate, sample))
@@ -196,7 +196,7 @@ def test_room_holds_what_the_residual_of_a_large_error_or_of_large_noise_rounds(
     plant = linear_plant(A=[[0.5]], B=[[1.0]], H=matched, sensor_bound=own, **settings)
     sets = sets_for_age_zero(plant, 1.0, error**2, 0.5, gain, 0.5)
     rng, moved = np.random.default_rng(0), 0.0
-    for _ in range(300):
+    for _ in range(150):
         estimate = np.array([SIMULATED_REACH * rng.uniform(0.6, 1.0)])
         sample = matched @ (estimate + error * rng.uniform(-1.0, 1.0)) + noise * rng.uniform(-1.0, 1.0) * matched[:, 0]
         moved = max(moved, rounded_away(gain, matched, estimate, sample))

@@ -2,12 +2,11 @@
 
 import json
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ncs_gym import Bounds, Box, Ellipsoid, LinearPlant, cart_pole, truck_trailer
+from ncs_gym import Ellipsoid, LinearPlant, cart_pole, truck_trailer
 from ncs_gym.plants.library import batch_reactor
 from ncs_gym.processes.cart_pole_process import nonlinear_cart_pole
 from tests.plants import delayed
@@ -104,8 +103,9 @@ def test_text_shows_slanted_rows_and_the_operating_point():
     assert "17 <= heat + 0.3 flow <= 23 (operating point 20)" in text
     assert "|flow| <= 0.1429" in text
     assert "-0.333333 <= u1 <= 1 (operating point 0.333333)" in text
+    pushed = {"disturbance_bound": (np.eye(2), [-0.1, -0.01], [0.3, 0.01])}
     assert "disturbance     x1 from -0.1 to 0.3, x2 up to 0.01\n" in str(
-        replace(PLANTS["truck"], bounds=Bounds(Box([-0.1, -0.01], [0.3, 0.01]), 0.0, 0.0), labels=None)
+        linear_plant(**STABLE | pushed, box=[5.0, 5.0], u_max=1.0)
     )
     assert "It is assumed that the first estimate is exact." in " ".join(text.split())
     assert "nan" not in text

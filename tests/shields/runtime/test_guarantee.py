@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, Packet
-from ncs_gym.plants.hard_bounds import SIMULATED_REACH
+from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields import SafetyFilter, certificate_for
 from shields.runtime import Decision

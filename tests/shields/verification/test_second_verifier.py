@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import truck_trailer
-from ncs_gym.uncertainty.truncated_gaussian import TruncatedGaussian, truncation_energy
+from ncs_gym.uncertainty.ellipsoid import TruncatedGaussian, truncation_energy
 from shields import verify
 from shields.verification.rational_matrix import is_positive_semidefinite, rational
 from tests.certificates import certificate_of
@@ -28,7 +28,7 @@ from tests.verdicts import verified
 # The record of a verdict, and what a certificate and a plant consist of.
 MAY_IMPORT = {
     "ncs_gym",
-    "ncs_gym.uncertainty.truncated_gaussian",
+    "ncs_gym.uncertainty.ellipsoid",
     "ncs_gym.validation",
     "shields",
     "shields.certificate",
