@@ -149,19 +149,17 @@ def multipliers_of(faces: Faces, row: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _multipliers(faces: Faces, row: np.ndarray) -> np.ndarray:
     above, below = np.isfinite(faces.high), np.isfinite(faces.low)
-    found = linprog(
-        -row,
-        A_ub=np.concatenate([faces.rows[above], -faces.rows[below]]),
-        b_ub=np.concatenate([faces.high[above], -faces.low[below]]),
-        bounds=(None, None),
-        method="highs",
-        options=_TOLERANCES,
-    )
+    rows = np.concatenate([faces.rows[above], -faces.rows[below]])
+    ends = np.concatenate([faces.high[above], -faces.low[below]])
     multipliers = np.zeros(len(faces.rows))
-    if found.status == 0:
-        prices = -found.ineqlin.marginals
-        multipliers[above] += prices[: np.count_nonzero(above)]
-        multipliers[below] -= prices[np.count_nonzero(above) :]
+    for presolve in (True, False):  # now and then a presolve fails
+        options = _TOLERANCES | {"presolve": presolve}
+        found = linprog(-row, A_ub=rows, b_ub=ends, bounds=(None, None), method="highs", options=options)
+        if found.status == 0:
+            prices = -found.ineqlin.marginals
+            multipliers[above] += prices[: np.count_nonzero(above)]
+            multipliers[below] -= prices[np.count_nonzero(above) :]
+            break
     return multipliers
 
 

@@ -127,11 +127,12 @@ def _with_polytope_of(
         except _NOT_CERTIFIED as none:
             failure = failure or none
             progress(f"polytope: {none}")
-            if isinstance(none, Infeasible) and none.binding != "R" and margin == min(MARGINS):
-                break  # a larger margin leaves less
+            too_many = isinstance(none, Infeasible) and none.binding == "R"
+            if margin == (max(MARGINS) if too_many else min(MARGINS)):
+                break  # a smaller margin makes more rows, a larger one leaves less
             continue
         try:
-            return _verified_polytope(certificate_with(polytope), plant, progress)
+            return _verified_polytope(certificate_with(polytope), plant)
         except _NOT_CERTIFIED as none:
             failure = failure or none
     assert failure is not None
@@ -184,14 +185,13 @@ def _by_share(
     return gains
 
 
-def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress) -> Certificate:
+def _verified_polytope(certificate: Certificate, plant: LinearPlant) -> Certificate:
     """Returns a certificate with a polytope, verified, with the polytope's size.
 
     Raises:
         Infeasible: If it does not verify.
     """
     assert certificate.polytope is not None
-    progress(f"exact verification: a polytope of {len(certificate.polytope.rows)} rows")
     report = verify(certificate, plant)
     if not report.valid:
         raise failed_verification(report)

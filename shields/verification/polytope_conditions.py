@@ -21,6 +21,7 @@ from shields.verification.rational_matrix import (
     multiply,
     quadratic,
     rational,
+    subtract,
     to_float,
     transpose,
     weighted_size,
@@ -123,15 +124,14 @@ class Faces(NamedTuple):
         self, image: list[Fraction], multipliers: np.ndarray, above: list[Fraction | None], below: list[Fraction | None]
     ) -> Fraction:
         """Returns sum_i max(lambda_i high_i, lambda_i low_i) + sum_k |r_k| w_k, which bounds image x from above."""
-        rest, total = list(image), Fraction(0)
-        for index in np.flatnonzero(multipliers):
+        chosen, total = dict[int, Fraction](), Fraction(0)
+        for index in np.flatnonzero(multipliers).tolist():
             multiplier = Fraction(float(multipliers[index]))
             end = above[index] if multiplier > 0 else below[index]
-            if end is None:  # the row does not bound it: without this multiplier more is left
-                continue
-            total += multiplier * end
-            rest = [left - multiplier * entry for left, entry in zip(rest, self.rows[index], strict=True)]
-        return total + weighted_size(rest, self.widths)
+            if end is not None:  # without the multiplier of a row that does not bound it more is left
+                chosen[index], total = multiplier, total + multiplier * end
+        made = multiply([list(chosen.values())], [self.rows[index] for index in chosen]) if chosen else []
+        return total + weighted_size(subtract([image], made)[0] if made else image, self.widths)
 
 
 def faces_of(polytope: Polytope, box_rows: int) -> Faces | None:
