@@ -27,8 +27,8 @@ from shields.verification import ACTION_ROUNDING
 # published plant that has a polytope.
 MOST_FOLLOWED = 2000
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
-# and for what others imply only up to some part of it. Where the first one makes too many rows, the largest one makes
-# fewest; those after it are for fallbacks that bear little more than their radii and leave no room for the larger ones.
+# and for what others imply only up to some part of it. Where the first one makes too many rows, the largest one mostly
+# makes fewest; those after it are for fallbacks that bear little more than their radii.
 MARGINS = (1e-6, 2e-4, 6e-5, 2e-5, 6e-6)
 # A row counts as implied by others up to this; next to the larger margin, up to this part of it.
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9

@@ -127,9 +127,8 @@ def _with_polytope_of(
         except _NOT_CERTIFIED as none:
             failure = failure or none
             progress(f"polytope: {none}")
-            too_many = isinstance(none, Infeasible) and none.binding == "R"
-            if margin == (max(MARGINS) if too_many else min(MARGINS)):
-                break  # a smaller margin makes more rows, a larger one leaves less
+            if isinstance(none, Infeasible) and none.binding != "R" and margin == min(MARGINS):
+                break  # a larger margin leaves less
             continue
         try:
             return _verified_polytope(certificate_with(polytope), plant)
