@@ -22,8 +22,8 @@ from shields.certificate_text import (
     size_of,
     table,
 )
+from shields.documents import content_of, document_of, write_document
 from shields.errors import CertificateError
-from shields.json_documents import content_of, document_of, write_document
 from shields.polytope import Polytope, polytope_content, polytope_of
 
 _FORMAT = "ncs-gym certificate 3"

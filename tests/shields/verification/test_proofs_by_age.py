@@ -8,7 +8,7 @@ import pytest
 from ncs_gym import ChannelContract
 from ncs_gym.plants.batch_reactor import batch_reactor
 from shields import Certificate, CertificateError
-from shields.json_documents import document_of, write_document
+from shields.documents import document_of, write_document
 from tests.certificates import certificate_of, with_proof
 from tests.product import library_plant
 from tests.verdicts import verified
