@@ -100,8 +100,11 @@ class Extremes:
 
     def of(self, row: np.ndarray) -> tuple[float, float]:
         """Returns the least and the largest row z, shape (n,), infinite where there is none."""
-        largest = self._largest(row)
-        return -largest if self._faces.are_symmetric else -self._largest(-row), largest
+        return self.least(row), self.largest(row)
+
+    def least(self, row: np.ndarray) -> float:
+        """Returns the least row z, shape (n,); minus infinity where there is none."""
+        return -self.largest(row if self._faces.are_symmetric else -row)
 
     def bounds(self, row: np.ndarray, reach: np.ndarray) -> tuple[float, float]:
         """Returns bounds of row z, shape (n,), that hold whatever the solver says, up to rounding.
@@ -116,7 +119,7 @@ class Extremes:
         return -above if self._faces.are_symmetric else -self._bound(-row, reach), above
 
     def _bound(self, row: np.ndarray, reach: np.ndarray) -> float:
-        self._largest(row)
+        self.largest(row)
         found = np.array(self._solver.getSolution().row_dual)
         some = found if found.shape == self._faces.low.shape and np.isfinite(found).all() else 0.0 * self._faces.low
         return min(self._bound_by(row, reach, each) for each in (some, -some, np.zeros(len(self._faces.rows))))
@@ -127,7 +130,8 @@ class Extremes:
         used = multipliers != 0.0
         return float(multipliers[used] @ ends[used] + np.abs(row - multipliers @ self._faces.rows) @ reach)
 
-    def _largest(self, row: np.ndarray) -> float:
+    def largest(self, row: np.ndarray) -> float:
+        """Returns the largest row z, shape (n,); infinity where there is none."""
         _check(row)
         solver = self._solver
         solver.changeColsCost(self._n, self._columns, row)

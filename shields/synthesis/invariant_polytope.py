@@ -332,10 +332,12 @@ def _extents(faces: Faces) -> np.ndarray:
 
 def _cuts(within: Extremes, row: Faces, implied: float) -> tuple[bool, bool]:
     """Returns whether the low and the high end of one row cut more than that off a polytope."""
-    least, largest = within.of(row.rows[0])
     low, high = float(row.low[0]), float(row.high[0])
     # An open end cuts nothing, even off what is unbounded.
-    return -math.inf < low and least < low - implied, high < math.inf and largest > high + implied
+    return (
+        low > -math.inf and within.least(row.rows[0]) < low - implied,
+        high < math.inf and within.largest(row.rows[0]) > high + implied,
+    )
 
 
 def _cuts_others(within: Extremes, number: int, implied: float) -> tuple[bool, bool]:
