@@ -25,7 +25,7 @@ from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import to_json
 from ncs_gym.reading import json_values
 from ncs_gym.validation import reason_of, shown
-from shields.atomic_write import write_atomically
+from shields.documents import write_atomically
 from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
 
 _FORMAT = "ncs-gym agent 3"

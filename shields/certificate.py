@@ -22,8 +22,8 @@ from shields.certificate_text import (
     size_of,
     table,
 )
+from shields.documents import content_of, document_of, write_document
 from shields.errors import CertificateError
-from shields.json_documents import content_of, document_of, write_document
 from shields.polytope import Polytope, polytope_content, polytope_of
 
 _FORMAT = "ncs-gym certificate 3"
@@ -340,11 +340,16 @@ class Certificate(ReadOnlyArrays):
         except (TypeError, ValueError, RecursionError) as error:
             raise CertificateError(str(error)) from error
         try:
-            return cls(**_fields_of(content))
+            certificate = cls(**_fields_of(content))
+            if _content_of(certificate) != content:
+                raise ValueError("it would be written otherwise")
         except CertificateError:
             raise
         except (KeyError, TypeError, ValueError) as error:
-            raise CertificateError(f"{name} is not a certificate: an entry is missing or of a wrong kind") from error
+            raise CertificateError(
+                f"{name} is not a certificate: an entry is missing, unknown, or of a wrong kind"
+            ) from error
+        return certificate
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Certificate:
@@ -390,7 +395,7 @@ def _listed(array: np.ndarray | None) -> list[float] | None:
 
 
 def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
-    """Raises KeyError, TypeError or ValueError if an entry is missing, of a wrong kind, or contradicts another one."""
+    """Raises KeyError, TypeError or ValueError if an entry is missing or of a wrong kind."""
     fields = {name: content[name] for name in ("L", "K", "D", "fingerprint", "provenance")}
     Sigma, ages, stated = content["Sigma"], content["ages"], content["multipliers"]
     fields["rounding"] = stated["rounding"]
@@ -404,8 +409,6 @@ def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
         sets = ages["sets"]
         *shapes, last = sets["shapes"]
         rows = list(zip(shapes, sets["rates"], ages["shares"], ages["inputs"], strict=True))
-        if list(own) != list(rows[-1]):
-            raise ValueError("what is repeated of the largest age differs")
         by_age = {name: sets[name] for name in ("gains", "shares", "noise")}
         fields["updates"] = Updates(contract=ChannelContract(**ages["contract"]), last=last, **by_age)
     fields["proofs"] = tuple(Proof(Sigma=Sigma, rate=rate, shares=shares, inputs=u) for Sigma, rate, shares, u in rows)

@@ -37,8 +37,8 @@ LAYERS = {
         {"registration"},
     ),
     "shields": (
-        {"errors", "atomic_write", "certificate_text"},
-        {"json_documents", "polytope"},
+        {"errors", "documents", "certificate_text"},
+        {"polytope"},
         {"certificate"},
         {"verification", "paper", "synthesis"},
         {"packaged_certificates"},

@@ -23,7 +23,7 @@ from experiments.errors import ClusterError, RunError, RunStopped
 from experiments.runs.training_run import RunResult, TrainingRun
 from experiments.settings import BackendSettings
 from experiments.terminal import progress_bar, say, warnings_sent
-from shields.atomic_write import write_atomically
+from shields.documents import write_atomically
 
 # How often the bar moves [s].
 _PERIOD = 0.5

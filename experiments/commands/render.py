@@ -22,7 +22,7 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.rendering import theme
 from ncs_gym.validation import counted
 from shields import Certificate, SafetyShield
-from shields.atomic_write import write_atomically
+from shields.documents import write_atomically
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 from experiments.errors import OtherResultsError
 from experiments.settings import lasting_settings
-from shields.atomic_write import write_atomically
+from shields.documents import write_atomically
 
 # Files by which a folder is known to hold results.
 _RESULTS = ("summary.json", "runs/*.json")

@@ -23,7 +23,7 @@ from experiments.settings import LearningSettings
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
 from shields import Certificate
-from shields.json_documents import digest
+from shields.documents import digest
 
 if TYPE_CHECKING:
     from agents.agent import Agent

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ncs_gym import Channel, LinearPlant
-from shields.atomic_write import write_atomically
 from shields.certificate import Certificate
+from shields.documents import write_atomically
 from shields.export.board_filter import BoardFilter
 from shields.export.board_table import BoardTable
 

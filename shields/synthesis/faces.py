@@ -100,8 +100,11 @@ class Extremes:
 
     def of(self, row: np.ndarray) -> tuple[float, float]:
         """Returns the least and the largest row z, shape (n,), infinite where there is none."""
-        largest = self._largest(row)
-        return -largest if self._faces.are_symmetric else -self._largest(-row), largest
+        return self.least(row), self.largest(row)
+
+    def least(self, row: np.ndarray) -> float:
+        """Returns the least row z, shape (n,); minus infinity where there is none."""
+        return -self.largest(row if self._faces.are_symmetric else -row)
 
     def bounds(self, row: np.ndarray, reach: np.ndarray) -> tuple[float, float]:
         """Returns bounds of row z, shape (n,), that hold whatever the solver says, up to rounding.
@@ -116,7 +119,7 @@ class Extremes:
         return -above if self._faces.are_symmetric else -self._bound(-row, reach), above
 
     def _bound(self, row: np.ndarray, reach: np.ndarray) -> float:
-        self._largest(row)
+        self.largest(row)
         found = np.array(self._solver.getSolution().row_dual)
         some = found if found.shape == self._faces.low.shape and np.isfinite(found).all() else 0.0 * self._faces.low
         return min(self._bound_by(row, reach, each) for each in (some, -some, np.zeros(len(self._faces.rows))))
@@ -127,7 +130,8 @@ class Extremes:
         used = multipliers != 0.0
         return float(multipliers[used] @ ends[used] + np.abs(row - multipliers @ self._faces.rows) @ reach)
 
-    def _largest(self, row: np.ndarray) -> float:
+    def largest(self, row: np.ndarray) -> float:
+        """Returns the largest row z, shape (n,); infinity where there is none."""
         _check(row)
         solver = self._solver
         solver.changeColsCost(self._n, self._columns, row)
@@ -149,19 +153,17 @@ def multipliers_of(faces: Faces, row: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _multipliers(faces: Faces, row: np.ndarray) -> np.ndarray:
     above, below = np.isfinite(faces.high), np.isfinite(faces.low)
-    found = linprog(
-        -row,
-        A_ub=np.concatenate([faces.rows[above], -faces.rows[below]]),
-        b_ub=np.concatenate([faces.high[above], -faces.low[below]]),
-        bounds=(None, None),
-        method="highs",
-        options=_TOLERANCES,
-    )
+    rows = np.concatenate([faces.rows[above], -faces.rows[below]])
+    ends = np.concatenate([faces.high[above], -faces.low[below]])
     multipliers = np.zeros(len(faces.rows))
-    if found.status == 0:
-        prices = -found.ineqlin.marginals
-        multipliers[above] += prices[: np.count_nonzero(above)]
-        multipliers[below] -= prices[np.count_nonzero(above) :]
+    for presolve in (True, False):  # now and then a presolve fails
+        options = _TOLERANCES | {"presolve": presolve}
+        found = linprog(-row, A_ub=rows, b_ub=ends, bounds=(None, None), method="highs", options=options)
+        if found.status == 0:
+            prices = -found.ineqlin.marginals
+            multipliers[above] += prices[: np.count_nonzero(above)]
+            multipliers[below] -= prices[np.count_nonzero(above) :]
+            break
     return multipliers
 
 

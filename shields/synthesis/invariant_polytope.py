@@ -27,9 +27,9 @@ from shields.verification import ACTION_ROUNDING
 # published plant that has a polytope.
 MOST_FOLLOWED = 2000
 # What the next states keep from every face, relative to the polytope: room for the rounding of rows and multipliers,
-# and for what others imply only up to some part of it. Where one makes too many rows, a larger one makes fewer; the
-# last one is for fallbacks that bear little more than their radii and leave no room for the larger ones.
-MARGINS = (1e-6, 2e-5, 6e-5, 2e-4, 6e-6)
+# and for what others imply only up to some part of it. Where the first one makes too many rows, the largest one mostly
+# makes fewest; those after it are for fallbacks that bear little more than their radii.
+MARGINS = (1e-6, 2e-4, 6e-5, 2e-5, 6e-6)
 # A row counts as implied by others up to this; next to the larger margin, up to this part of it.
 _IMPLIED, _NEARLY_IMPLIED = 1e-9, 0.9
 # States reach this far in their units, up to this power of ten and down to it, or are sought again in units of that.
@@ -97,9 +97,11 @@ def invariant_polytope(
     faces = invariant_faces(step.first_faces(), step.predecessor, kept, progress, implied)
     extents = _extents(faces) if step.has_free_states else np.ones(plant.n)
     if (np.abs(np.log10(extents)) > _SIMILAR).any():  # how far states go is known now
-        step.limited = np.isinf(extents)
-        step.widths = step.widths * np.where(step.limited, 1.0, extents)
-        faces = invariant_faces(step.first_faces(), step.predecessor, kept, progress, implied)
+        limited = np.isinf(extents)
+        grown, own, ones = np.where(limited, 1.0, extents), np.eye(plant.n)[limited], np.ones(np.count_nonzero(limited))
+        step.widths = step.widths * grown
+        faces = faces._replace(rows=faces.rows * grown).followed_by(Faces(own, -ones, ones))
+        faces = invariant_faces(faces, step.predecessor, kept, progress, implied)
     physical = step.in_physical_units(faces)
     upper, lower = step.multipliers(physical)
     return Polytope(
@@ -250,14 +252,10 @@ class _ClosedLoop:
         self._K, self._errors, self._D, self.rest = feedback
         self.widths = units_of_states(plant, self.rest)
         self.has_free_states = self.widths is not plant.half_widths
-        self.limited = np.zeros(plant.n, bool)
         self.next = plant.A + plant.B @ self._K
 
     def first_faces(self) -> Faces:
-        """Returns the faces of the box, of input limits, of limits within a step, and of those of `limited` states.
-
-        Raises Infeasible if errors and disturbances alone leave one.
-        """
+        """Returns the faces of the box, of inputs, and within a step; raises Infeasible if errors alone leave one."""
         plant, (x_c, u_c) = self.plant, self.rest
         reached = plant.box @ x_c
         box = in_half_ranges(plant.box, *(plant.box_ends - reached))
@@ -276,8 +274,7 @@ class _ClosedLoop:
                 "that answers less, leave room"
             )
         faces = box.followed_by(inputs).followed_by(in_half_ranges(within.rows, low, high))
-        own, ones = np.eye(plant.n)[self.limited], np.ones(np.count_nonzero(self.limited))
-        return faces._replace(rows=faces.rows * self.widths).followed_by(Faces(own, -ones, ones))
+        return faces._replace(rows=faces.rows * self.widths)
 
     def predecessor(self, faces: Faces) -> Faces:
         """Returns what states have to fulfil so that the next ones fulfil rows; raises Infeasible as `first_faces`."""
@@ -335,10 +332,12 @@ def _extents(faces: Faces) -> np.ndarray:
 
 def _cuts(within: Extremes, row: Faces, implied: float) -> tuple[bool, bool]:
     """Returns whether the low and the high end of one row cut more than that off a polytope."""
-    least, largest = within.of(row.rows[0])
     low, high = float(row.low[0]), float(row.high[0])
     # An open end cuts nothing, even off what is unbounded.
-    return -math.inf < low and least < low - implied, high < math.inf and largest > high + implied
+    return (
+        low > -math.inf and within.least(row.rows[0]) < low - implied,
+        high < math.inf and within.largest(row.rows[0]) > high + implied,
+    )
 
 
 def _cuts_others(within: Extremes, number: int, implied: float) -> tuple[bool, bool]:

@@ -44,8 +44,9 @@ from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.tolerance import Tolerated, most_tolerant
 from shields.verification import verify
 
-# The largest ellipsoid in a polytope is shrunk to this in its faces, more than its digits are rounded by.
-_INSIDE = 1.0 - 1e-9
+# The largest ellipsoid in a polytope is shrunk to this in its faces, more than its digits are rounded by; a thin one,
+# of which rounding takes half of that, once more.
+_INSIDE, _THIN_INSIDE = 1.0 - 1e-9, 1.0 - 1e-4
 # Points of the box by which resting points are compared.
 _POINTS_OF_REST_LOG2 = 12
 # For so many gains a polytope is sought.
@@ -106,10 +107,16 @@ def certified_polytope(
         if exact.rank(plant.box) < plant.n:  # a polytope may have no end, or a very far one, where a state has no limit
             inside = np.concatenate([inside, limits.box_rows])
         L = largest_box_ellipsoid(inside)
-        L = shape_in_digits(L * (_INSIDE / ((faces @ L) * faces).sum(axis=1).max()))
+        L = shape_in_digits(L * (_INSIDE / _reach(faces, L)))
+        L = L if _reach(faces, L) < 0.5 * (1.0 + _INSIDE) else shape_in_digits(_THIN_INSIDE * L)
         return Certificate(L=L, polytope=polytope, provenance=provenance_of(plant, L), **others)
 
     return _with_polytope_of(feedback, plant, certificate, progress)
+
+
+def _reach(faces: np.ndarray, L: np.ndarray) -> float:
+    """Returns the largest f L f' of faces, shape (q, n): E(L) lies between them if it is at most 1."""
+    return float(((faces @ L) * faces).sum(axis=1).max())
 
 
 def _with_polytope_of(
@@ -131,7 +138,7 @@ def _with_polytope_of(
                 break  # a larger margin leaves less
             continue
         try:
-            return _verified_polytope(certificate_with(polytope), plant, progress)
+            return _verified_polytope(certificate_with(polytope), plant)
         except _NOT_CERTIFIED as none:
             failure = failure or none
     assert failure is not None
@@ -184,14 +191,13 @@ def _by_share(
     return gains
 
 
-def _verified_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress) -> Certificate:
+def _verified_polytope(certificate: Certificate, plant: LinearPlant) -> Certificate:
     """Returns a certificate with a polytope, verified, with the polytope's size.
 
     Raises:
         Infeasible: If it does not verify.
     """
     assert certificate.polytope is not None
-    progress(f"exact verification: a polytope of {len(certificate.polytope.rows)} rows")
     report = verify(certificate, plant)
     if not report.valid:
         raise failed_verification(report)

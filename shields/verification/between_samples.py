@@ -10,12 +10,11 @@ import numpy as np
 
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
-from shields.verification.condition import ACTION_ROUNDING, Condition, flag, scalar_condition
-from shields.verification.polytope_conditions import faces_of, root_above, widths_of
+from shields.verification.condition import Condition, flag, scalar_condition
+from shields.verification.polytope_conditions import ends_from, faces_of, reach_of_error, root_above, widths_of
 from shields.verification.rational_matrix import (
     Matrix,
     add,
-    congruence,
     multiply,
     quadratic,
     rational,
@@ -49,7 +48,7 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
     fits = fits and rows.remainder.shape == (k,) and bool(np.isfinite(rows.remainder).all())
     fits = fits and bool((rows.state[0] == plant.box).all()) and not rows.input[0].any()
     yield flag("between samples: the grid has all its points and begins with the safe box", fits)
-    low, high = ([Fraction(float(end)) if np.isfinite(end) else None for end in side] for side in plant.box_ends)
+    low, high = (ends_from(side, Fraction(0)) for side in plant.box_ends)
     widths = widths_of(rational(plant.box), low, high, k)
     yield flag("between samples: the box bounds every state", widths is not None)
     if not fits or widths is None:
@@ -74,25 +73,20 @@ def _closed_loop_conditions(certificate: Certificate, plant: LinearPlant) -> Ite
     assert rows is not None
     L, K, D = rational(certificate.L), rational(certificate.K), rational(certificate.D)
     x_c, u_c = rational(certificate.resting_state), rational(certificate.resting_input)
-    errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
-    half = [Fraction(float(each)) for each in plant.input_half]
-    faces = None if polytope is None else faces_of(polytope, k)
+    faces, reach = None if polytope is None else faces_of(polytope, k), reach_of_error(certificate, plant)
     for j, row in enumerate(rational(plant.box)):
         taken = Fraction(float(rows.remainder[j])) + root_above(quadratic([row], D))
         for i in range(len(rows.state)):
             moved, pushed = rational(rows.state[i, j]), rational(rows.input[i, j])
             image = add(moved, multiply(pushed, K))[0]
-            least = taken + root_above(max(quadratic(pushed, error) for error in errors))
-            least += ACTION_ROUNDING * weighted_size(pushed[0], half)
+            least = taken + reach(pushed[0])
             at_rest = multiply(moved, transpose(x_c))[0][0] + multiply(pushed, transpose(u_c))[0][0]
-            low, high = (
-                Fraction(float(ends[j])) - at_rest if np.isfinite(ends[j]) else None for ends in plant.box_ends
-            )
             if certificate.keeps_ellipsoid:  # symmetric limits
                 on_ellipsoid = 1 - least - root_above(quadratic([image], L))
                 yield scalar_condition(f"(B) |c x| + rho <= 1 - eta on S at tau_{i} of row {j + 1}", on_ellipsoid)
             if faces is not None:
-                left = faces.left_of(image, len(faces.rows) + plant.m + i * k + j, low, high) - least
+                ends = ends_from(plant.box_ends[:, j], at_rest)
+                left = faces.left_of(image, len(faces.rows) + plant.m + i * k + j, *ends) - least
                 yield scalar_condition(f"(PB) |c x| + rho <= 1 - eta on the polytope at tau_{i} of row {j + 1}", left)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ from shields.verification.rational_matrix import (
     multiply,
     quadratic,
     rational,
+    subtract,
     to_float,
     transpose,
     weighted_size,
@@ -53,43 +54,40 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     yield flag("polytope: it bounds every state", faces is not None)
     if faces is None:
         return
-    G, B, K = faces.rows, rational(plant.B), rational(certificate.K)
-    next_rows = multiply(G, add(rational(plant.A), multiply(B, K)))
+    G, B, K, reach = faces.rows, rational(plant.B), rational(certificate.K), reach_of_error(certificate, plant)
     pushed, D = multiply(G, B), rational(certificate.D)
-    errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
-    half = [Fraction(float(each)) for each in plant.input_half]
-    for i, image in enumerate(next_rows):
-        s = root_above(max(quadratic([pushed[i]], error) for error in errors))
-        d = root_above(quadratic([G[i]], D))
-        d += ACTION_ROUNDING * weighted_size(pushed[i], half)
-        left = faces.left_of(image, i, faces.low[i], faces.high[i]) - s - d
+    for i, image in enumerate(multiply(G, add(rational(plant.A), multiply(B, K)))):
+        taken = reach(pushed[i]) + root_above(quadratic([G[i]], D))
+        left = faces.left_of(image, i, faces.low[i], faces.high[i]) - taken
         yield scalar_condition(f"(P) sum |lambda| + |r| w + s + d <= 1 of row {i + 1}", left)
-    for i, (gain, limit) in enumerate(zip(K, half, strict=True)):
-        rho = limit * root_above(max(error[i][i] for error in errors) / limit**2) + ACTION_ROUNDING * limit
-        u_c = Fraction(float(certificate.resting_input[i]))
-        low, high = (Fraction(float(end[i])) - u_c for end in plant.input_ends)
-        left = faces.left_of(gain, len(rows) + i, low, high) - rho
+    u_c, unit = rational(certificate.resting_input)[0], rational(np.eye(plant.m))
+    for i, gain in enumerate(K):
+        left = faces.left_of(gain, len(rows) + i, *ends_from(plant.input_ends[:, i], u_c[i])) - reach(unit[i])
         yield scalar_condition(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
-    yield from _mixed_conditions(faces, certificate, plant, images)
-
-
-def _mixed_conditions(faces: Faces, certificate: Certificate, plant: LinearPlant, images: int) -> Iterator[Condition]:
-    """Checks (PM): limits of states and inputs together hold with the fallback, for every state of the polytope.
-
-    f x + g u = (f + g K) x - g K e around what it is at rest, and u is applied with what rounding an action does.
-    """
-    K, half = rational(certificate.K), [Fraction(float(each)) for each in plant.input_half]
-    rest = rational(np.concatenate([certificate.resting_state, certificate.resting_input]))[0]
-    errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
-    for j, row in enumerate(rational(plant.mixed_rows) if len(plant.mixed_rows) else ()):
-        pushed = row[plant.n :]
-        image = add([row[: plant.n]], multiply([pushed], K))[0]
-        least = root_above(max(quadratic([pushed], error) for error in errors))
-        least += ACTION_ROUNDING * weighted_size(pushed, half)
-        at_rest = sum((entry * value for entry, value in zip(row, rest, strict=True)), Fraction(0))
-        low, high = (Fraction(float(ends[j])) - at_rest if np.isfinite(ends[j]) else None for ends in plant.mixed_ends)
-        left = faces.left_of(image, images - len(plant.mixed_rows) + j, low, high) - least
+    # (PM): f x + g u = (f + g K) x - g K e around what it is at rest.
+    rest = rational(np.concatenate([certificate.resting_state, certificate.resting_input]))
+    for j, row in enumerate(plant.mixed_rows):
+        mixed = rational(row)
+        image = add([mixed[0][: plant.n]], multiply([mixed[0][plant.n :]], K))[0]
+        ends = ends_from(plant.mixed_ends[:, j], multiply(mixed, transpose(rest))[0][0])
+        left = faces.left_of(image, images - len(plant.mixed_rows) + j, *ends) - reach(mixed[0][plant.n :])
         yield scalar_condition(f"(PM) limit {j + 1} of states and inputs together holds on the polytope", left)
+
+
+def reach_of_error(certificate: Certificate, plant: LinearPlant) -> Callable[[list[Fraction]], Fraction]:
+    """Returns what bounds a row of inputs, over all errors of the estimate in the fallback and roundings of actions."""
+    K, half = rational(certificate.K), [Fraction(float(each)) for each in plant.input_half]
+    errors = [congruence(K, rational(proof.Sigma)) for proof in certificate.proofs]
+
+    def reach(row: list[Fraction]) -> Fraction:
+        return root_above(max(quadratic([row], error) for error in errors)) + ACTION_ROUNDING * weighted_size(row, half)
+
+    return reach
+
+
+def ends_from(ends: np.ndarray, at: Fraction) -> list[Fraction | None]:
+    """Returns two ends, counted from a number; None for one that is open."""
+    return [Fraction(float(end)) - at if np.isfinite(end) else None for end in ends]
 
 
 class Faces(NamedTuple):
@@ -123,25 +121,22 @@ class Faces(NamedTuple):
         self, image: list[Fraction], multipliers: np.ndarray, above: list[Fraction | None], below: list[Fraction | None]
     ) -> Fraction:
         """Returns sum_i max(lambda_i high_i, lambda_i low_i) + sum_k |r_k| w_k, which bounds image x from above."""
-        rest, total = list(image), Fraction(0)
-        for index in np.flatnonzero(multipliers):
+        chosen, total = dict[int, Fraction](), Fraction(0)
+        for index in np.flatnonzero(multipliers).tolist():
             multiplier = Fraction(float(multipliers[index]))
             end = above[index] if multiplier > 0 else below[index]
-            if end is None:  # the row does not bound it: without this multiplier more is left
-                continue
-            total += multiplier * end
-            rest = [left - multiplier * entry for left, entry in zip(rest, self.rows[index], strict=True)]
-        return total + weighted_size(rest, self.widths)
+            if end is not None:  # without the multiplier of a row that does not bound it more is left
+                chosen[index], total = multiplier, total + multiplier * end
+        made = multiply([list(chosen.values())], [self.rows[index] for index in chosen]) if chosen else []
+        return total + weighted_size(subtract([image], made)[0] if made else image, self.widths)
 
 
 def faces_of(polytope: Polytope, box_rows: int) -> Faces | None:
     """Returns a polytope around its center in rational numbers; None if its rows do not bound every state."""
     rows, center = rational(polytope.rows), rational(polytope.center)[0]
     reached = [sum((g * c for g, c in zip(row, center, strict=True)), Fraction(0)) for row in rows]
-    low, high = (
-        [Fraction(float(end)) - at if np.isfinite(end) else None for end, at in zip(ends, reached, strict=True)]
-        for ends in (polytope.low, polytope.high)
-    )
+    pairs = zip(np.stack([polytope.low, polytope.high]).T, reached, strict=True)
+    low, high = map(list, zip(*(ends_from(*pair) for pair in pairs), strict=True))
     widths = widths_of(rows, low, high, box_rows)
     if widths is None:
         return None

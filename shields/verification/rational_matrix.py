@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
+from math import lcm
 
 import numpy as np
 
@@ -32,8 +33,17 @@ def scale(factor: Fraction, matrix: Matrix) -> Matrix:
 
 def multiply(left: Matrix, right: Matrix) -> Matrix:
     """Returns left @ right."""
-    columns = list(zip(*right, strict=True))
-    return [[sum((a * b for a, b in zip(row, column, strict=True)), Fraction(0)) for column in columns] for row in left]
+    rows, columns = [_whole(row) for row in left], [_whole(column) for column in zip(*right, strict=True)]
+    return [
+        [Fraction(sum(x * y for x, y in zip(row, column, strict=True)), a * b) for column, b in columns]
+        for row, a in rows
+    ]
+
+
+def _whole(entries: Sequence[Fraction]) -> tuple[list[int], int]:
+    """Returns rational numbers as whole multiples of one over a common denominator, and the denominator."""
+    common = lcm(*(entry.denominator for entry in entries))
+    return [entry.numerator * (common // entry.denominator) for entry in entries], common
 
 
 def transpose(matrix: Matrix) -> Matrix:

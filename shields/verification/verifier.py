@@ -84,19 +84,16 @@ def require_valid(certificate: Certificate, plant: LinearPlant) -> None:
     _require_kinds(certificate, plant)
     rows = b"".join(each.tobytes() for each in plant.grid_rows or ())  # computed, and verified with the rest
     key = certificate.document["sha256"], plant.digest(), rows
-    if key not in _valid:
-        _require_conditions(certificate, plant)
-        _valid.add(key)
-
-
-def _require_conditions(certificate: Certificate, plant: LinearPlant) -> None:
-    for condition in verify(certificate, plant).conditions:
-        if not condition.holds:
-            if condition.name.startswith("plant"):
-                raise CertificateError(
-                    "the certificate was made for another plant, or for other times at which its box counts "
-                    "(fingerprints differ): synthesize one for this plant"
-                )
-            raise CertificateError(
-                f"the certificate does not verify: {condition.name} does not hold (margin {condition.margin:.3g})"
-            )
+    if key in _valid:
+        return
+    broken = next((each for each in verify(certificate, plant).conditions if not each.holds), None)
+    if broken is not None and broken.name.startswith("plant"):
+        raise CertificateError(
+            "the certificate was made for another plant, or for other times at which its box counts (fingerprints "
+            "differ): synthesize one for this plant"
+        )
+    if broken is not None:
+        raise CertificateError(
+            f"the certificate does not verify: {broken.name} does not hold (margin {broken.margin:.3g})"
+        )
+    _valid.add(key)

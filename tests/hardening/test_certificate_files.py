@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shields import Certificate, CertificateError
-from shields.json_documents import digest
+from shields.documents import digest
 from tests.certificates import certificate_of
 from tests.fuzz import examples
 from tests.plants import named

@@ -44,7 +44,7 @@ def test_a_reader_never_sees_half_a_file(certificate, tmp_path, monkeypatch):
         assert path.read_bytes() == before  # the old file stands while the new one is written
         raise OSError("disk full")
 
-    monkeypatch.setattr("shields.atomic_write.os.fsync", fail)
+    monkeypatch.setattr("shields.documents.os.fsync", fail)
     with pytest.raises(OSError, match="disk full"):
         certificate.save(path)
     assert path.read_bytes() == before

@@ -12,7 +12,7 @@ import pytest
 from ncs_gym import truck_trailer
 from shields import Certificate, CertificateError, Infeasible, requirements, verify
 from shields.certificate import Proof
-from shields.json_documents import document_of
+from shields.documents import document_of
 from shields.paper.synthesis import kappa_rho_grid
 from tests.certificates import certificate_of
 from tests.plants import named, servo

@@ -14,7 +14,7 @@ import pytest
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.plants.family import Remainder
 from shields import Certificate, CertificateError
-from shields.json_documents import document_of
+from shields.documents import document_of
 from shields.verification import require_valid
 from tests.certificates import certificate_of, with_proof
 from tests.plants import named

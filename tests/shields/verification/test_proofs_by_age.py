@@ -8,7 +8,7 @@ import pytest
 from ncs_gym import ChannelContract
 from ncs_gym.plants.library import batch_reactor
 from shields import Certificate, CertificateError
-from shields.json_documents import document_of, write_document
+from shields.documents import document_of, write_document
 from tests.certificates import certificate_of, with_proof
 from tests.product import library_plant
 from tests.verdicts import verified
@@ -82,9 +82,13 @@ def test_proof_by_age_that_does_not_fit_together_is_no_certificate(promised, cha
         lambda content: content["multipliers"].update(error=0.5),
         lambda content: content["multipliers"].update(inputs=[0.5, 0.5]),
         lambda content: content["Sigma"][0].__setitem__(0, 1.1 * content["Sigma"][0][0]),
+        lambda content: content.update(other=0.5),
+        lambda content: content["multipliers"].update(other=0.5),
+        lambda content: content["ages"]["sets"].update(other=[0.5]),
+        lambda content: content["ages"]["contract"].update(other=0.5),
     ],
 )
-def test_file_that_says_two_things_of_the_largest_age_is_refused(promised, change, tmp_path):
+def test_file_that_says_two_things_of_the_largest_age_or_something_unknown_is_refused(promised, change, tmp_path):
     _, certificate = promised
     content = certificate.document["certificate"]
     path = tmp_path / "c.json"

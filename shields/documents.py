@@ -1,15 +1,45 @@
-"""JSON documents that say what they are: the name of their format, the checksum of their content, and the content."""
+"""Files that a reader sees completely or not at all, and JSON documents: format, checksum of the content, content."""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import uuid
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ncs_gym.reading import json_values
-from shields.atomic_write import write_atomically
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Writes a temporary file in the same directory, then renames it to `path`.
+
+    Args:
+        path: Destination; an existing file is replaced.
+        content: Text is encoded as UTF-8.
+
+    Raises:
+        OSError: If the file cannot be written; the temporary file is removed.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+    try:
+        with temporary.open("xb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        if error.filename:
+            error.filename = str(path)
+        raise
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def digest(content: Any) -> str:
