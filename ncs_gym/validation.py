@@ -234,26 +234,17 @@ def as_covariance(value: Any, size: int | None, name: str) -> np.ndarray:
     return matrix + COVARIANCE_ROUNDING * np.diag(variances) if smallest < -EIGENVALUE_ROUNDING else matrix
 
 
-def as_number(
-    value: Any,
-    name: str,
-    *,
-    low: float = -np.inf,
-    high: float = np.inf,
-    low_open: bool = False,
-    high_open: bool = False,
-) -> float:
+def as_number(value: Any, name: str, *, low: float = -np.inf, high: float = np.inf, low_open: bool = False) -> float:
     """Returns `value` as a finite float inside an interval, or raises ValueError."""
     wanted = f"{'>' if low_open else '>='} {low:g}" if np.isfinite(low) else "finite"
-    wanted += f" and {'<' if high_open else '<='} {high:g}" if np.isfinite(high) else ""
+    wanted += f" and <= {high:g}" if np.isfinite(high) else ""
     try:
         single = as_setting(float(value) if type(value) is int else value)  # numpy knows no longer ones
     except OverflowError:
         single = None
     number = np.nan if single is None or single.ndim else float(single)
     above = number > low if low_open else number >= low
-    below = number < high if high_open else number <= high
-    if not (np.isfinite(number) and above and below):
+    if not (np.isfinite(number) and above and number <= high):
         raise ValueError(f"{name} must be a number {wanted}, got {shown(value)}")
     bounded = np.isfinite(low) and np.isfinite(high)
     if not (bounded or number == 0.0 or SMALLEST_NUMBER <= abs(number) < LARGEST_NUMBER):
