@@ -1,4 +1,4 @@
-"""What commands show on a terminal: tables, prose, messages beside a progress bar, and warnings as sentences."""
+"""What commands show on a terminal: tables, prose, messages beside a progress bar, errors and warnings as sentences."""
 
 from __future__ import annotations
 
@@ -56,6 +56,20 @@ def wrapped(text: str, *, label: str = "", indent: int = 2) -> str:
         break_long_words=False,
     )
     return wrapper.fill(text.replace(" %", "\0%")).replace("\0", " ")
+
+
+def sentence_of(error: BaseException) -> str:
+    """Returns an error as one printable line; only unexpected errors show their type."""
+    from ncs_gym.validation import printable
+
+    ours = type(error).__module__.partition(".")[0] == "experiments"
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+    elif ours or isinstance(error, (ValueError, OSError, ImportError)):
+        text = str(error)
+    else:
+        text = f"{type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)"
+    return printable(" ".join(text.split()))
 
 
 def say(line: str, indent: int = 2) -> None:

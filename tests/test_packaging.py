@@ -48,12 +48,11 @@ LAYERS = {
     "agents": (
         {"hyperparams"},
         {"loop", "results", "sb3_vec_env"},
-        {"algorithms", "callbacks", "evaluation", "agent_file"},
-        {"agent"},
+        {"agent", "algorithms", "callbacks", "evaluation"},
         {"training"},
     ),
     "experiments": (
-        {"errors", "terminal"},
+        {"terminal"},
         {"settings", "baselines"},
         {"runs"},
         {"backends", "analysis", "plots"},

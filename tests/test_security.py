@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.agent import Agent
-from agents.agent_file import AgentError
+from agents.agent import Agent, AgentError
 from agents.loop import LoopConfig
 from agents.training import untrained
 from tests.command import assert_one_sentence, ncs

@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from agents.agent_file import pretrained_folders
+from agents.agent import pretrained_folders
 from experiments.analysis.episodes import (
     arm_summaries,
     episodes_table,

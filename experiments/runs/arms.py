@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
-from agents.agent_file import AGENT_FILES, pretrained_folder
+from agents.agent import AGENT_FILES, pretrained_folder
 from agents.hyperparams import ALGORITHMS, with_changes
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines.controllers import CONTROLLERS, REGULATORS, why_aimless

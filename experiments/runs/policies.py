@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from agents.agent_file import AgentError, pretrained_folder
+from agents.agent import Agent, AgentError, pretrained_folder
 from experiments.baselines.controllers import REGULATORS, controller
 from experiments.baselines.tuned import tuned_weights
 from experiments.terminal import say
 from ncs_gym import NCSEnv
 from shields.certificate import Fallback
-
-if TYPE_CHECKING:
-    from agents.agent import Agent
 
 # Controllers that need neither training nor a certificate.
 _UNTRAINED = ("zero input", "random", *REGULATORS)
@@ -60,8 +56,6 @@ def agent_named(name: str, env_id: str | None) -> tuple[Agent, Path]:
         AgentError: If there is no agent, or it is of another environment.
         ValueError: If the folder of a run holds several agents, or nothing says of which environment the agent is.
     """
-    from agents import Agent  # imports torch, or says what to install
-
     path = _only_agent(Path(name))
     if name != PRETRAINED and not path.exists():
         raise ValueError(f"no agent in {name}: there is no such file or folder")

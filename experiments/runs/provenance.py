@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from cloudpickle import dumps
 
-from agents.agent_file import installed_versions
+from agents.agent import installed_versions
 from agents.loop import LoopConfig
 from experiments.settings import LearningSettings, id_alone, lasting_settings
 from ncs_gym.envs.env import ncs_env

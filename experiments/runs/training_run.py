@@ -7,10 +7,11 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from agents.agent import Agent
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
@@ -24,9 +25,6 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
 from shields import Certificate
 from shields.json_documents import digest
-
-if TYPE_CHECKING:
-    from agents.agent import Agent
 
 
 @dataclass(frozen=True)
@@ -204,8 +202,6 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
 def _agent_of(run: TrainingRun) -> Agent | None:
     """Returns the agent that a run does not train: that of its files, one with initial weights, or None."""
     if run.agent_files:
-        from agents.agent import Agent  # imports torch
-
         return Agent.of_files(run.agent_files)
     if run.policy_kind != "untrained":
         return None

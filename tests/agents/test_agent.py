@@ -7,8 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.agent import Agent, Normalization
-from agents.agent_file import AgentError
+from agents.agent import Agent, AgentError, Normalization
 from agents.hyperparams import with_changes
 from agents.loop import LoopConfig, ShieldSettings
 from agents.training import train
