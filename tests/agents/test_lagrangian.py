@@ -61,17 +61,16 @@ def test_an_episode_is_as_long_as_the_environment_says():
     settings = LagrangianSettings(cost_limit=2.0, multiplier=1.0)
     for env, kwargs, steps in (
         ("Own50-v0", {}, 50),
-        (CRUISE.env, {}, 200),
         (CRUISE.env, {"max_episode_steps": 40}, 40),
     ):
         loop = LoopConfig(env=env, kwargs=kwargs, lagrangian=settings)
         assert loop.episode_steps == steps
-        history = train(loop, 600, 0, hyperparams=TINY).history
+        history = train(loop, 400, 0, hyperparams=TINY).history
         price, before = settings.multiplier, 0
         for point in history:
             cost = (point.violation_steps - before) / 200 * steps
             price, before = max(0.0, price + settings.learning_rate * (cost - 2.0)), point.violation_steps
             assert point.multiplier == pytest.approx(price)
-        assert len(history) == 3  # a rollout is shorter than an episode
+        assert len(history) == 2  # a rollout is shorter than an episode
     with pytest.raises(ValueError, match="OwnWithoutEnd-v0 has no max_episode_steps"):
         LoopConfig(env="OwnWithoutEnd-v0", lagrangian=settings)
