@@ -205,5 +205,5 @@ def test_distributions_hold_every_file_of_the_repository_and_the_four_packages_a
     assert {name for name in names if not name.endswith(".dist-info")} == set(ORDER)
     sources = {path for package in ORDER for path in (ROOT / package).rglob("*") if path.is_file()}
     assert files >= {path.relative_to(ROOT).as_posix() for path in sources if "__pycache__" not in path.parts}
-    data = {"experiments/report/templates/comparison.html.j2", "agents/tuned/ppo.json"}
+    data = {"experiments/templates/comparison.html.j2", "agents/tuned/ppo.json"}
     assert {f"{package}/py.typed" for package in ORDER} | data <= files

@@ -11,7 +11,7 @@ import tyro
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary
-from experiments.report.text_tables import summary_text
+from experiments.report import summary_text
 from experiments.runs.loops import certificate_of, registered_env, with_channel
 from experiments.runs.output_folder import require_place, write_json
 from experiments.runs.policies import agent_named, certificate_file

@@ -10,7 +10,7 @@ import pandas as pd
 
 from experiments.analysis.episodes import arm_summaries, episodes_table, parquet, training_table
 from experiments.backends.execution import results_of
-from experiments.report.text_tables import sweep_table
+from experiments.report import sweep_table
 from experiments.runs.arms import full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results

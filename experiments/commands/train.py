@@ -7,7 +7,7 @@ from pathlib import Path
 
 from experiments.analysis.episodes import arm_summary
 from experiments.backends.execution import results_of
-from experiments.report.text_tables import summary_text
+from experiments.report import summary_text
 from experiments.runs.arms import Arm, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results

@@ -121,7 +121,7 @@ def test_trace_of_a_channel_has_a_largest_length():
 
 
 def test_contracts_of_a_long_record_take_few_rows():
-    from experiments.analysis.stalls import broken_contracts
+    from experiments.commands.channel import broken_contracts
 
     ages = np.zeros(300_000, dtype=int)
     ages[5] = 3000

@@ -10,7 +10,7 @@ from agents.loop import LoopConfig
 from experiments.analysis.episodes import arm_summary, episodes_table, paired_differences
 from experiments.commands.compare import CompareSettings, shortened
 from experiments.commands.train import TrainSettings, train
-from experiments.report.text_tables import summary_text
+from experiments.report import summary_text
 from experiments.runs.arms import full_names, require_arms, run_of_arm
 from experiments.runs.training_run import RunResult
 from tests.experiments.results import episode

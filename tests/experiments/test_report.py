@@ -4,7 +4,7 @@ import re
 from functools import cache
 from html.parser import HTMLParser
 
-from experiments.report.html import comparison_report
+from experiments.report import comparison_report
 from shields import Report
 from shields.verification.condition import flag
 from tests.experiments.results import ALL_ARMS, run, summary_of
