@@ -12,7 +12,7 @@ import matplotlib
 import numpy as np
 
 from benchmarks.commands import run, table
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
+from experiments.figures import STYLE, CaptionedFigure, label, legend_below
 from ncs_gym import LinearPlant, NCSEnv, NCSVectorEnv
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.plants.lqr import lqr_gain

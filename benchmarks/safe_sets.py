@@ -19,7 +19,7 @@ from scipy.optimize import linprog
 from benchmarks.commands import run, table
 from benchmarks.timing import least_times, timed
 from experiments.baselines.controllers import controller
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
+from experiments.figures import STYLE, CaptionedFigure, label, legend_below
 from ncs_gym import LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Infeasible, SafetyFilter, VectorSafetyShield, synthesize

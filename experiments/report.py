@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from experiments.analysis.statistics import CONFIDENCE, RESAMPLES
-from experiments.plots.figure_style import arm_styles
+from experiments.figures import arm_styles
 from experiments.runs.arms import Arm
 from experiments.runs.loops import AS_TRAINED
 from experiments.terminal import text_table, wrapped

@@ -55,7 +55,7 @@ LAYERS = {
         {"terminal"},
         {"settings", "baselines"},
         {"runs"},
-        {"backends", "analysis", "plots"},
+        {"backends", "analysis", "figures"},
         {"report", "paper"},
         {"commands"},
         {"__main__"},

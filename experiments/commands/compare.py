@@ -18,7 +18,7 @@ from experiments.analysis.episodes import (
 )
 from experiments.backends.execution import results_of
 from experiments.baselines.controllers import why_aimless
-from experiments.plots.comparison_figures import comparison_figures
+from experiments.figures import comparison_figures
 from experiments.report import comparison_report, decimals_of, summary_text
 from experiments.runs.arms import Arm, by_arm, full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config, registered_env
