@@ -78,16 +78,6 @@ def require_horizon(settings: Any, *modes: str | None) -> None:
         raise ValueError(f"--horizon {settings.horizon} is for mode lookahead, which is not asked for")
 
 
-def short_version(settings: Any, **budget: Any) -> Any:
-    """Returns the settings of a command's short version if `--smoke` is given, else the same."""
-    if not settings.smoke:
-        return settings
-    default = type(settings).out
-    if settings.out == default:  # what the whole version leaves there stays
-        budget["out"] = default.with_stem(f"{default.stem}-smoke")
-    return replace(settings, **budget)
-
-
 @dataclass(frozen=True, kw_only=True)
 class PlantSettings:
     """Which plant a command is about.
@@ -168,7 +158,6 @@ class LearningSettings(BackendSettings):
         hyperparams: Hyperparameters in the words of stable-baselines3, such as gamma=0.99 or
             'policy_kwargs={"net_arch": [64]}'; others are tuned for the environment, or the default.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
-        smoke: Run a short version to see that everything works, by default in a folder with -smoke in its name.
         force: Replace results of other settings in the output folder.
     """
 
@@ -187,7 +176,6 @@ class LearningSettings(BackendSettings):
     channel: Assignments = field(default_factory=dict)
     hyperparams: Assignments = field(default_factory=dict)
     lagrangian: tyro.conf.Suppress[LagrangianSettings] = field(default_factory=LagrangianSettings)
-    smoke: bool = False
     force: bool = False
 
     @property

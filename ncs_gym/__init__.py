@@ -22,10 +22,7 @@ from ncs_gym.processes.linearization import linear_model
 from ncs_gym.processes.process import FunctionProcess
 from ncs_gym.recording import bounds_from_recording
 from ncs_gym.registration import register_all, register_plant
-from ncs_gym.tasks.base_task import Task
-from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.tasks.setpoint_tracking import SetpointTracking
-from ncs_gym.tasks.speed_tracking import SpeedTracking
+from ncs_gym.tasks import Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.uncertainty.disturbances import (
     AdversarialDisturbance,
     BoxDisturbance,

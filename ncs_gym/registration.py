@@ -29,10 +29,7 @@ from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess, inverted_pendulum
 from ncs_gym.processes.process import Process
-from ncs_gym.tasks.base_task import Task
-from ncs_gym.tasks.regulation import Regulation
-from ncs_gym.tasks.setpoint_tracking import SetpointTracking
-from ncs_gym.tasks.speed_tracking import SpeedTracking
+from ncs_gym.tasks import Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.uncertainty.disturbances import BallDisturbance, BoxDisturbance, Disturbance, SinusoidDisturbance
 from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count

@@ -8,4 +8,7 @@ from ncs_gym.tasks.regulation import Regulation
 from ncs_gym.tasks.setpoint_tracking import SetpointTracking
 from ncs_gym.tasks.speed_tracking import SpeedTracking
 
-__all__ = ["Regulation", "SetpointTracking", "SpeedTracking", "Task"]
+# Settings of these are JSON values.
+TASKS = (Regulation, SpeedTracking, SetpointTracking)
+
+__all__ = ["TASKS", "Regulation", "SetpointTracking", "SpeedTracking", "Task"]
