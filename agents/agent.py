@@ -194,8 +194,8 @@ class Agent:
             return cls.of_files({name: read_file(folder / name, most) for name, most in AGENT_FILES.items()})
         except OSError as error:
             raise AgentError(
-                f"no agent in {folder}: cannot read {Path(error.filename).name} ({error.strerror}); `ncs compare` "
-                "leaves agents in OUT/models"
+                f"no agent in {folder}: cannot read {Path(error.filename).name} ({error.strerror}); agents are in "
+                "OUT/models of what trained them"
             ) from error
 
     @classmethod

@@ -28,8 +28,8 @@ class EvaluateSettings:
     """Evaluates a trained agent, behind a shield or not, on any channel.
 
     Attributes:
-        model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
-            `ncs train`; or "pretrained", for the agent of --env that comes with the package.
+        model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare` and `ncs train`; or
+            "pretrained", for the agent of --env that comes with the package.
         env: Id of the environment the agent was trained in, or module:id.
         shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
             nothing and counts what it would have done.

@@ -93,7 +93,7 @@ ONE_SENTENCE = [
     ("synthesize --env ncs_gym:CartPole-v1", "expected an NCSEnv inside", "ncs_gym.Networked puts a network"),
     ("render --out a.avi", "--out must end in .gif or .png"),
     ("render --policy nowhere", "no policy nowhere:", "those with a name are zero input, random, lqr"),
-    ("evaluate nofile.zip", "no agent in nofile.zip: there is no such file or folder"),
+    ("evaluate nofile.zip", "no agent in nofile.zip: cannot read agent.json"),
 ]  # fmt: skip
 
 # Known without a certificate, which may take minutes.
