@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from textwrap import TextWrapper
 from typing import TYPE_CHECKING, Any
@@ -118,19 +118,6 @@ def warnings_as_sentences() -> Iterator[None]:
             shown.add(text)
             say(f"ncs: warning: {text}", indent=5)
 
-    with _shown_by(show):
-        yield
-
-
-@contextmanager
-def warnings_sent(send: Callable[[str], object]) -> Iterator[None]:
-    """Sends the text of each warning."""
-    with _shown_by(lambda message, *origin, **more: send(str(message))):
-        yield
-
-
-@contextmanager
-def _shown_by(show: Callable[..., object]) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield

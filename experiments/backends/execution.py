@@ -21,7 +21,7 @@ from typing import Any
 from agents.agent import AGENT_FILES
 from experiments.runs.training_run import RunResult, TrainingRun
 from experiments.settings import BackendSettings
-from experiments.terminal import progress_bar, say, sentence_of, warnings_sent
+from experiments.terminal import progress_bar, say, sentence_of
 from shields.atomic_write import write_atomically
 
 # How often the bar moves [s].
@@ -147,9 +147,9 @@ def executed(
     run: TrainingRun, report: Callable[[int], None], log_folder: Path | None = None
 ) -> tuple[RunResult, list[str]]:
     """Returns the result of a run, and the texts of its warnings; for arguments see `TrainingRun.execute`."""
-    texts: list[str] = []
-    with warnings_sent(texts.append):
-        return run.execute(report, log_folder), texts
+    with warnings.catch_warnings(record=True) as caught:
+        result = run.execute(report, log_folder)
+    return result, [str(each.message) for each in caught]
 
 
 @contextmanager
