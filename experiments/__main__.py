@@ -135,13 +135,10 @@ def _description(settings: type) -> str:
 
 
 def _complain(sentence: str, code: int) -> int:
-    """Prints an error on one line, on a terminal on lines of its width, and returns the exit code."""
-    text = f"ncs: {sentence}"
-    if sys.stderr.isatty():
-        from experiments.terminal import wrapped
+    """Prints an error and returns the exit code."""
+    from experiments.terminal import say
 
-        text = wrapped(text, indent=5)
-    print(text, file=sys.stderr, flush=True)
+    say(f"ncs: {sentence}", indent=5)
     return code
 
 

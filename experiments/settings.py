@@ -27,20 +27,14 @@ def _assignments(texts: list[str]) -> dict[str, Any]:
             raise ValueError(f"expected NAME=VALUE, such as gamma=0.99, got {shown(text)}")
         if name in found:
             raise ValueError(f"{name} is given twice")
-        found[name] = _value(name, value)
+        try:
+            found[name] = json.loads(value)
+        except (ValueError, RecursionError):
+            found[name] = value
+            if not re.fullmatch(r"[\w.+-]+", value):
+                form = """a word or a JSON value, such as 0.99, true or '{"net_arch": [64]}'"""
+                raise ValueError(f"expected {name}=VALUE with {form}, got {shown(value)}") from None
     return found
-
-
-def _value(name: str, text: str) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        if not re.fullmatch(r"[\w.+-]+", text):
-            raise ValueError(
-                f"expected {name}=VALUE with a word or a JSON value, such as 0.99, true or '{{\"net_arch\": [64]}}', "
-                f"got {shown(text)}"
-            ) from None
-        return text
 
 
 # Arguments in a form that the parser does not know: `--channel loss=0.5 delay=3`.
