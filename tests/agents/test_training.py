@@ -42,6 +42,8 @@ def test_same_seed_trains_the_same_agent():
     np.testing.assert_array_equal(actions_of(first), actions_of(second))
     assert [point.violation_steps for point in first.history] == [point.violation_steps for point in second.history]
     assert (actions_of(trained(seed=4)) != actions_of(first)).any()
+    start, again = (untrained(CRUISE, 3, hyperparams=TINY) for _ in range(2))
+    assert start.checksum == again.checksum != first.agent.checksum  # a single rollout is learned from
 
 
 def test_training_counts_every_violating_step(monkeypatch):
@@ -91,12 +93,6 @@ def test_every_algorithm_trains_counts_and_repeats_itself(algorithm, settings, a
         second = train(shielded(), 320, 3, algorithm, settings)
         assert (second.steps, second.interventions) == (first.steps, first.interventions)
         np.testing.assert_array_equal(actions_of(first), actions_of(second))
-
-
-def test_a_single_rollout_is_learned_from():
-    agent, start = train(CRUISE, 256, 0, hyperparams=TINY).agent, untrained(CRUISE, 0, hyperparams=TINY)
-    assert agent.checksum != start.checksum
-    np.testing.assert_array_equal(start.act(OBSERVATIONS), untrained(CRUISE, 0, hyperparams=TINY).act(OBSERVATIONS))
 
 
 def test_rate_falls_from_its_full_value_to_that_of_the_last_rollout_unless_it_is_constant():
