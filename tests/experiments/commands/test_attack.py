@@ -66,14 +66,6 @@ def test_the_attack_does_harm_where_the_shield_only_watches():
     assert counts["guaranteed outside S"] == counts["guaranteed outside box"] == 0
 
 
-@pytest.mark.slow  # the campaign attacks plans in every day's tests
-def test_lookahead_may_leave_the_safe_set_and_keeps_the_box():
-    run = succeeded("attack", "--env", CART, "--mode", "lookahead", "--steps", 1)
-    _, _, outside_set, *others, _ = rows_of(run)["all"]
-    assert int(outside_set.replace(",", "")) > 100
-    assert others == ["0", "0"]
-
-
 @pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("said", "words"),
@@ -151,12 +143,6 @@ def test_agents_are_random_outward_turned_round_and_bang_bang():
 def assert_safe(counts):
     assert counts["outside S"] == counts["outside box"] == counts["no claim"] == counts["lost"] == 0
     assert counts["overridden"] > 0
-
-
-def test_shielded_pendulum_never_leaves_the_safe_set_and_the_other_one_does(short):
-    rare = channels_of(Channel(), ncs_env(gym.make("ncs_gym/Pendulum-v0")).contract)["rare"]
-    assert_safe(counts_of(shield_of("ncs_gym/Pendulum-v0", 8, channel=rare)))
-    assert counts_of(shield_of("ncs_gym/Pendulum-v0", 4, "monitor", channel=rare))["outside box"] > 0
 
 
 @pytest.mark.slow
