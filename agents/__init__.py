@@ -8,7 +8,7 @@ first asked for.
 
 from typing import TYPE_CHECKING, Any
 
-from agents.agent_file import AgentError, pretrained_folder
+from agents.agent import Agent, AgentError, pretrained, pretrained_folder
 from agents.evaluation import evaluate
 from agents.hyperparams import tuned_hyperparams, tuned_steps
 from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
@@ -16,7 +16,6 @@ from agents.results import Episode, Evaluation, TrainingPoint
 from ncs_gym.installation import install_command
 
 if TYPE_CHECKING:
-    from agents.agent import Agent, pretrained
     from agents.callbacks import DualAscentCallback, SafetyCallback
     from agents.sb3_vec_env import SB3VecEnv
     from agents.training import TrainingResult, train, untrained
@@ -55,10 +54,10 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        from agents import agent, training
+        from agents import training
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "stable_baselines3"):
             raise
         needed = f"agents.{name} needs stable_baselines3 and torch, and {error.name} is not installed"
         raise ModuleNotFoundError(f"{needed}: {install_command('train')}", name=error.name) from error
-    return getattr(training if hasattr(training, name) else agent, name)
+    return getattr(training, name)

@@ -1,35 +1,47 @@
-"""A trained policy, and its files: `agent.json`, and stable-baselines3's `model.zip`, whose weights alone are read."""
+"""A trained policy, and its files: `agent.json`, and stable-baselines3's `model.zip`, whose weights alone are read.
+
+torch is imported where an agent is read.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
-from collections.abc import Mapping
+import platform
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import resources
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.agent_file import AgentError, installed_versions, pretrained_folder, read_files
-from agents.algorithms import build_model
 from agents.hyperparams import complete_hyperparams
 from agents.loop import LoopConfig, ShieldSettings
-from agents.sb3_vec_env import SB3VecEnv
 from ncs_gym import Channel, LinearPlant
 from ncs_gym.envs.json_settings import to_json
-from ncs_gym.reading import json_values
+from ncs_gym.reading import LARGEST_DOCUMENT, LARGEST_MODEL, json_values, read_file
 from ncs_gym.validation import reason_of, shown
 from shields.documents import write_atomically
 from shields.runtime.safety_filter import LONGEST_HORIZON, MODES
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecNormalize
+
+# Files of an agent, and how many bytes each may have.
+AGENT_FILES = {"agent.json": LARGEST_DOCUMENT, "model.zip": LARGEST_MODEL}
 _FORMAT = "ncs-gym agent 3"
 _DEPENDENCIES = ("ncs-gym", "stable-baselines3", "sb3-contrib", "torch", "gymnasium", "mujoco", "numpy")
+
+
+class AgentError(ValueError):
+    """A file or folder holds no agent, a damaged or altered one, or one of another environment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,13 +179,24 @@ class Agent:
 
     @classmethod
     def load(cls, folder: str | Path) -> Agent:
-        """Returns the agent saved in a folder; of `model.zip` torch reads the weights alone (`weights_only=True`).
+        """Returns the agent of a folder, or of a file in it.
+
+        Of `model.zip` torch reads the weights alone (`weights_only=True`).
 
         Raises:
-            AgentError: If the files are missing, damaged, of another format or of an environment that has changed.
+            AgentError: If the files are missing, too large, damaged, of another format or of an environment that has
+                changed.
             ModuleNotFoundError: If a package that the algorithm or the environment needs is not installed.
         """
-        return cls.of_files(read_files(folder))
+        folder = Path(folder)
+        folder = folder.parent if folder.name in AGENT_FILES else folder
+        try:
+            return cls.of_files({name: read_file(folder / name, most) for name, most in AGENT_FILES.items()})
+        except OSError as error:
+            raise AgentError(
+                f"no agent in {folder}: cannot read {Path(error.filename).name} ({error.strerror}); agents are in "
+                "OUT/models of what trained them"
+            ) from error
 
     @classmethod
     def of_files(cls, files: Mapping[str, bytes]) -> Agent:
@@ -204,6 +227,29 @@ def pretrained(env_id: str) -> Agent:
         AgentError: If the package has none for it, or the environment has changed since.
     """
     return Agent.load(pretrained_folder(env_id))
+
+
+def pretrained_folder(env_id: str) -> Path:
+    """Returns the folder of the small agent that comes with the package for an id; raises AgentError if it has none."""
+    found = pretrained_folders()
+    if env_id not in found:
+        raise AgentError(f"there is no pretrained agent of {shown(env_id)}, only of {', '.join(found)}")
+    return found[env_id]
+
+
+def pretrained_folders() -> dict[str, Path]:
+    """Returns the folders of the agents that come with the package by id."""
+    root = Path(str(resources.files("agents"))) / "trained"
+    return {f"ncs_gym/{file.parent.name}": file.parent for file in sorted(root.glob("*/agent.json"))}
+
+
+def installed_versions(packages: Iterable[str]) -> dict[str, str]:
+    """Returns the versions of Python and of those packages that are installed."""
+    found = {"python": platform.python_version()}
+    for name in packages:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def require_kept(kwargs: Mapping[str, Any], env_id: str) -> None:
@@ -251,6 +297,9 @@ def _rebuilt(content: dict[str, Any], weights: bytes) -> Agent:
     shield = content["shield"] or {"mode": None, "horizon": None}
     if shield["mode"] not in (None, *MODES) or shield["horizon"] not in (None, *range(1, LONGEST_HORIZON + 1)):
         raise AgentError("the agent is damaged: there is no shield of that mode and horizon")
+    from agents import SB3VecEnv  # imports torch, or says what to install
+    from agents.algorithms import build_model
+
     envs = SB3VecEnv(loop.vector(2))
     numbers = content["normalization"]
     mean, variance = (np.array(numbers[name], dtype=np.float64) for name in ("mean", "variance"))

@@ -38,7 +38,7 @@ from benchmarks.timing import timed
 from experiments.baselines.controllers import REGULATORS, controller
 from experiments.baselines.filters import EstimateFilterSettings
 from experiments.baselines.tuned import tuned_weights
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
+from experiments.figures import STYLE, CaptionedFigure, label, legend_below
 from experiments.terminal import text_table
 from ncs_gym import (
     Actuator,

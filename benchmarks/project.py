@@ -67,7 +67,7 @@ def templates_and_data() -> list[Path]:
     """Returns templates, and the JSON files of the packages but certificates and trained agents."""
     data = [path for folder in PACKAGES for path in (ROOT / folder).rglob("*.json")]
     return [
-        *(ROOT / "experiments" / "report" / "templates").iterdir(),
+        *(ROOT / "experiments" / "templates").iterdir(),
         *(ROOT / "shields" / "export" / "templates").iterdir(),
         *(path for path in data if not {"packaged_certificates", "trained"} & set(path.parts)),
     ]

@@ -1,37 +1,28 @@
 """How large safe sets are, and what a larger one gives: `python -m benchmarks.safe_sets COMMAND`.
 
-Commands: sections, polytope, packages, between-samples.
+Commands: sections, between-samples.
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
-import signal
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import matplotlib
 import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
-from scipy.stats import qmc
 
 from benchmarks.commands import run, table
 from benchmarks.timing import least_times, timed
 from experiments.baselines.controllers import controller
-from experiments.plots.figure_style import STYLE, CaptionedFigure, label, legend_below
+from experiments.figures import STYLE, CaptionedFigure, label, legend_below
 from ncs_gym import LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env
 from shields import Certificate, Infeasible, SafetyFilter, VectorSafetyShield, synthesize
-from shields.synthesis.invariant_polytope import Faces, in_half_ranges, invariant_faces
-from shields.synthesis.polytope_certificates import with_polytope
-from shields.verification import ACTION_ROUNDING
 
 IDS = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum")
 # The two states that are shown where there are more: angle and rate of the pole; the reactor's first and third.
@@ -84,8 +75,7 @@ def sections(out: Path = Path("safe-sets.png"), ids: Sequence[str] = IDS) -> Non
     """Draws sections through the origin of ellipsoid, polytope and what no controller can exceed.
 
     States that are not on an axis are zero. The upper bound are states from which some inputs within the limits keep
-    the plant in the box for 100 steps if the state is known and nothing disturbs it. `polytope` prints shares of the
-    box.
+    the plant in the box for 100 steps if the state is known and nothing disturbs it.
     """
     angles = np.linspace(0.0, np.pi, 120, endpoint=False)  # the corners of the box among them
     with matplotlib.rc_context(STYLE):
@@ -116,179 +106,6 @@ def sections(out: Path = Path("safe-sets.png"), ids: Sequence[str] = IDS) -> Non
             label(axes, x, y, name)
         legend_below(figure, handles)
         out.write_bytes(figure.png)
-
-
-def _deciding(shield: SafetyFilter, inside: Certificate, count: int) -> Callable[[], object]:
-    """Returns decisions about estimates in the safe set of a certificate, and random inputs."""
-    rng, plant = np.random.default_rng(0), shield.plant
-    estimates = (inside.safe_set.sample_boundary(rng, count) * rng.uniform(0.2, 0.9, (count, 1))).T.copy()
-    proposals = rng.uniform(-1.0, 1.0, (plant.m, count)) * plant.u_max[:, None]
-    errors = shield.errors_of(0.5 * shield.certificate.error_shapes[0])
-    if count == 1:
-        return lambda: shield.decide(estimates[:, 0], errors, proposals[:, 0])
-    batch = errors.batch().of(np.zeros(count, np.int64))
-    return lambda: shield.decide_columns(estimates, batch, proposals)
-
-
-def _behind(name: str, certificate: Certificate, steps: int, **settings: Any) -> tuple[float, float]:
-    """Returns the share of overridden steps and the reward per step of an LQR behind a shield in mode "project"."""
-    envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20, **settings), certificate)
-    policy = controller("lqr", _env(name), certificate.fallback, 0)
-    observations, info = envs.reset(seed=0)
-    sums = np.zeros(2)
-    for _ in range(steps // 20):
-        observations, reward, *_, info = envs.step(policy(observations, info).astype(np.float32))
-        sums += info["shield_intervened"].sum(), reward.sum()
-    overridden, total = sums / (steps // 20 * 20)
-    return overridden, total
-
-
-def polytope(ids: Sequence[str] = IDS, steps: int = 8000) -> None:
-    """What a polytope in place of the ellipsoid gives, and what it costs, for registered environments.
-
-    Two safe sets: the ellipsoid, and the polytope that its gain keeps in the box. "share" is the part of the safe box's
-    volume that the set fills, "s" the processor's time for finding and proving it, on top of the ellipsoid for the
-    polytope. "x 1", "x 64" and "x 1024" compare a decision to one with the ellipsoid, for one loop and for batches.
-    "overridden" and "reward" (per step) are those of an LQR behind the shield, in the same episodes.
-    """
-    columns = ("safe set", "rows", "share", "s", "x 1", "x 64", "x 1024", "overridden", "reward")
-    show = table("id", *columns, first=20, width=7)
-    for name in ids:
-        env = _env(name)
-        plant, contract = env.plant, env.certificate_contract
-        plain, seconds = timed(synthesize, plant, contract=contract, safe_set="ellipsoid")
-        made = {"ellipsoid": (plain, seconds)}
-        made["polytope"] = timed(with_polytope, plain, plant)
-        shields = [SafetyFilter(certificate, plant) for certificate, _ in made.values()]
-        inside = made["polytope"][0]
-        works = [[_deciding(shield, inside, count) for shield in shields] for count in (1, 64, 1024)]
-        times = np.array([least_times(each) for each in works])
-        for k, (kind, (certificate, seconds)) in enumerate(made.items()):
-            rows = getattr(certificate.polytope, "rows", ())
-            share = certificate.provenance["polytope_share_of_box" if len(rows) else "share_of_box"]
-            ratios = [f"{ratio:.2f}" for ratio in times[:, k] / times[:, 0]]
-            overridden, reward = _behind(name, certificate, steps)
-            found = (f"{share:.1%}", f"{seconds:.1f}", *ratios, f"{overridden:.1%}", f"{reward:.3f}")
-            show(name, kind, len(rows) or "", *found)
-
-
-class Case(NamedTuple):
-    """A closed loop in units of the box: z+ = A z + w with |rows z| <= 1 and |w_k| <= W_k."""
-
-    A: np.ndarray
-    rows: np.ndarray
-    W: np.ndarray
-
-
-def case_of(name: str) -> Case:
-    env = _env(name)
-    plant, certificate = env.plant, synthesize(env.plant, contract=env.certificate_contract, safe_set="ellipsoid")
-    widths, K = plant.half_widths, certificate.K
-    reach = np.sqrt(np.einsum("ij,kjl,il->ki", K, certificate.error_shapes, K).max(axis=0))
-    inputs = K / (plant.u_max * (1.0 - float(ACTION_ROUNDING)) - reach)[:, None]
-    pushed = plant.B @ K
-    errors = np.sqrt(np.einsum("ij,kjl,il->ki", pushed, certificate.error_shapes, pushed).max(axis=0))
-    W = errors + np.sqrt(np.diag(certificate.D))
-    return Case(
-        (plant.A + pushed) * widths / widths[:, None], np.concatenate([plant.box_rows, inputs]) * widths, W / widths
-    )
-
-
-def ours(case: Case) -> np.ndarray:
-    def predecessor(faces: Faces) -> Faces:
-        # What the search keeps from every face for the rounding of rows and multipliers, as in the synthesis.
-        taken = 1e-6 + np.abs(faces.rows) @ case.W
-        return in_half_ranges(faces.rows @ case.A, faces.low + taken, faces.high - taken)
-
-    ones = np.ones(len(case.rows))
-    rows = invariant_faces(Faces(case.rows, -ones, ones), predecessor, case.A.shape[0]).rows
-    return np.concatenate([rows, -rows])
-
-
-def by_polytope(case: Case) -> np.ndarray:
-    from polytope import Polytope, is_subset, reduce  # pyright: ignore[reportMissingImports]
-
-    now = Polytope(np.concatenate([case.rows, -case.rows]), np.ones(2 * len(case.rows)))
-    while True:
-        left = now.b - np.abs(now.A) @ case.W
-        following = reduce(Polytope(np.vstack([now.A, now.A @ case.A]), np.append(now.b, left)))
-        if is_subset(now, following):
-            return now.A / now.b[:, None]
-        now = following
-
-
-def by_ampyc(case: Case) -> np.ndarray:
-    from ampyc.utils import Polytope  # pyright: ignore[reportMissingImports]
-    from ampyc.utils.set_computation import compute_mrpi  # pyright: ignore[reportMissingImports]
-
-    n, count = len(case.W), len(case.rows)
-    start = Polytope(np.concatenate([case.rows, -case.rows]), np.ones(2 * count))
-    W = Polytope(np.concatenate([np.eye(n), -np.eye(n)]), np.tile(case.W, 2))
-    with contextlib.redirect_stdout(io.StringIO()):
-        found = compute_mrpi(start, case.A, W, max_iter=10_000)
-    return found.A / found.b[:, None]
-
-
-def shortfall(faces: np.ndarray, case: Case) -> Fraction:
-    """Returns by how much the worst face fails in rational arithmetic; at most zero if the set is invariant."""
-    worst = Fraction(-1)
-    exact = [[Fraction(float(entry)) for entry in face] for face in faces]
-    A, W = ([[Fraction(float(entry)) for entry in row] for row in matrix] for matrix in (case.A.T, case.W[:, None]))
-    for face in exact:
-        image = [sum(a * f for a, f in zip(column, face, strict=True)) for column in A]
-        found = linprog(-np.array(image, float), A_ub=faces, b_ub=np.ones(len(faces)), bounds=(None, None))
-        if found.status != 0:
-            return Fraction(1)
-        multipliers = [Fraction(max(0.0, -float(price))) for price in found.ineqlin.marginals]
-        rest = list(image)
-        for multiplier, other in zip(multipliers, exact, strict=True):
-            if multiplier:
-                rest = [left - multiplier * entry for left, entry in zip(rest, other, strict=True)]
-        support = sum(abs(f) * w for f, (w,) in zip(face, W, strict=True))
-        worst = max(worst, Fraction(sum(multipliers) + sum(map(abs, rest)) + support - 1))
-    return worst
-
-
-def packages(
-    ids: Sequence[str] = ("TruckTrailerCruise", "BatchReactor", "Pendulum", "CartPole"), longest: int = 300
-) -> None:
-    """The largest robustly invariant polytope by other packages (pip install polytope ampyc), on the same closed loop.
-
-    All of them get A+BK, the box with the rows of the input limits, and W, the smallest box around what errors of the
-    estimate and disturbances do in a step: the packages take polytopes only. "ours" is the search of `synthesize` with
-    this W, "polytope" the textbook iteration with that package's intersection and reduction, "ampyc" its
-    `compute_mrpi`. "exact" says whether the result is invariant in rational arithmetic: for every face f with f x <= 1
-    there are multipliers with sum(lambda) + sum |f (A+BK) - lambda F|_k w_k + support of W <= 1, found by a linear
-    program and not trusted; if not, by how much the worst face fails. CPU time; what takes longer than `--longest`
-    seconds is stopped.
-    """
-    show = table("id", "by", "seconds", "faces", "of box", "exact", first=20, width=10)
-    for name in ids:
-        case = case_of(name)
-        for tool, find in {"ours": ours, "polytope": by_polytope, "ampyc": by_ampyc}.items():
-            show(name, tool, *_judged(find, case, longest))
-
-
-def _judged(find: Callable[[Case], np.ndarray], case: Case, longest: int) -> tuple[str, str, str, str]:
-    """Returns seconds, faces, share of the box, and what rational arithmetic says of a search."""
-
-    def stop(*_: object) -> None:
-        raise TimeoutError
-
-    signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, longest)
-    begin = time.process_time()
-    try:
-        faces = find(case)
-    except (TimeoutError, Infeasible) as none:
-        return f"{time.process_time() - begin:.2f}", "-", "-", f"  {str(none) or 'stopped'}"
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-    seconds = time.process_time() - begin
-    points = 2.0 * qmc.Sobol(len(case.W), scramble=False).random_base2(16) - 1.0
-    share, failing = ((points @ faces.T).max(axis=1) <= 1.0).mean(), shortfall(faces, case)
-    verdict = "holds" if failing <= 0 else f"  fails by {float(failing):.1e}"
-    return f"{seconds:.2f}", str(len(faces)), f"{share:.1%}", verdict
 
 
 def between_samples(ids: Sequence[str] = tuple(POINTS), points: int = 0, steps: int = 8000) -> None:
@@ -347,6 +164,31 @@ def _left(name: str, plant: LinearPlant, steps: int) -> float:
     return most
 
 
+def _deciding(shield: SafetyFilter, inside: Certificate, count: int) -> Callable[[], object]:
+    """Returns decisions about estimates in the safe set of a certificate, and random inputs."""
+    rng, plant = np.random.default_rng(0), shield.plant
+    estimates = (inside.safe_set.sample_boundary(rng, count) * rng.uniform(0.2, 0.9, (count, 1))).T.copy()
+    proposals = rng.uniform(-1.0, 1.0, (plant.m, count)) * plant.u_max[:, None]
+    errors = shield.errors_of(0.5 * shield.certificate.error_shapes[0])
+    if count == 1:
+        return lambda: shield.decide(estimates[:, 0], errors, proposals[:, 0])
+    batch = errors.batch().of(np.zeros(count, np.int64))
+    return lambda: shield.decide_columns(estimates, batch, proposals)
+
+
+def _behind(name: str, certificate: Certificate, steps: int, **settings: Any) -> tuple[float, float]:
+    """Returns the share of overridden steps and the reward per step of an LQR behind a shield in mode "project"."""
+    envs = VectorSafetyShield(gym.make_vec(f"ncs_gym/{name}-v0", num_envs=20, **settings), certificate)
+    policy = controller("lqr", _env(name), certificate.fallback, 0)
+    observations, info = envs.reset(seed=0)
+    sums = np.zeros(2)
+    for _ in range(steps // 20):
+        observations, reward, *_, info = envs.step(policy(observations, info).astype(np.float32))
+        sums += info["shield_intervened"].sum(), reward.sum()
+    overridden, total = sums / (steps // 20 * 20)
+    return overridden, total
+
+
 def _stepping(name: str, plant: LinearPlant, number: int) -> Callable[[], object]:
     """Returns a step of an environment, or of many."""
     settings = {"plant": plant, "terminate_on_violation": False}
@@ -359,7 +201,7 @@ def _stepping(name: str, plant: LinearPlant, number: int) -> Callable[[], object
     return lambda: env.step(action)
 
 
-COMMANDS = (sections, polytope, packages, between_samples)
+COMMANDS = (sections, between_samples)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

@@ -1,28 +1,26 @@
 """What a shield costs, and where its proof ends: `python -m benchmarks.shield COMMAND`.
 
-Commands: cost, decision, loop, board, memory, containment, mismatch.
+Commands: cost, decision, board, memory, containment, mismatch.
 """
 
 from __future__ import annotations
 
 import gc
-import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Any
 
 import cvxpy as cp
 import gymnasium as gym
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from benchmarks.commands import run, some_of, table
+from benchmarks.commands import run, table
 from benchmarks.random_plants import random_plant
 from benchmarks.timing import Steps, microseconds, resident, timed
 from experiments.commands.attack import hostile_agents, starts, worst_case
 from ncs_gym import (
-    Actuator,
     Bounds,
     Channel,
     ChannelContract,
@@ -32,12 +30,9 @@ from ncs_gym import (
     NCSEnv,
     NCSVectorEnv,
     Packet,
-    cart_pole,
-    truck_trailer,
 )
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.library import batch_reactor
 from ncs_gym.registration import EPISODE_STEPS
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, certificate_for, synthesize
@@ -152,73 +147,6 @@ def decision(steps: int = 400) -> None:
         show(
             name, f"{ours:.1f}", *columns, f"{theirs:.0f}", f"{theirs / ours:.0f}x", f"{share:.1%}", f"{max(gaps):.1e}"
         )
-
-
-PLANTS = {"truck-trailer": truck_trailer(mass=4000.0), "cart-pole": cart_pole(), "batch reactor": batch_reactor()}
-MODES = ("project", "switch", "boundary", "lookahead", "monitor")
-
-
-def loop(
-    steps: int = 100_000,
-    plants: Annotated[Sequence[str], some_of(tuple(PLANTS))] = tuple(PLANTS),
-    modes: Annotated[Sequence[str], some_of(MODES)] = MODES,
-) -> None:
-    """How long a step of a `SafeLoop` behind a downlink takes, by mode: receive, decide, command.
-
-    Median, 99.9 % and largest in microseconds, of the thread's own time on the processor and, whatever else the machine
-    does, on the clock; and by how much the resident memory has grown since a tenth of the steps. The loop meets every
-    arrival history for the first time; the row below is about its second half, when most have been met. The garbage
-    collector is frozen and off.
-    """
-    gc.disable()
-    columns = ("median", "99.9 %", "largest")
-    show = table(
-        f"{steps:,} steps [us]", "mode", *columns, *(f"clock {each}" for each in columns), "memory [MB]", first=16
-    )
-    for name in plants:
-        plant = PLANTS[name]
-        certificate = synthesize(plant, contract=ChannelContract(6))
-        for mode in modes:
-            gc.collect()
-            gc.freeze()
-            taken, grown = _steps(certificate, plant, mode, steps)
-            for row, part in ((name, taken), ("  second half", taken[:, steps // 2 :])):
-                quantiles = np.quantile(part, [0.5, 0.999, 1.0], axis=1).T.ravel()
-                show(row, mode, *(f"{each:.0f}" for each in quantiles), f"{grown:.1f}")
-
-
-def _steps(certificate: Any, plant: LinearPlant, mode: str, steps: int) -> tuple[np.ndarray, float]:
-    """Microseconds of each step on the processor and on the clock, shape (2, steps), and the growth of memory [MB]."""
-    channel = Channel(loss=0.2, delay=1, jitter=1, max_consecutive_losses=2)
-    on_air = replace(channel, delay=0)  # what arrives is received at the next step
-    downlink = Channel(loss=0.2, delay=1, max_consecutive_losses=1)
-    settings = {"downlink": downlink, "echo_age": 10, "on_unproved": "ignore"}
-    loop = SafeLoop(certificate, plant, channel, mode, 6 if mode == "lookahead" else None, **settings)
-    rng = np.random.default_rng(0)
-    actuator = Actuator(loop.input_delay, plant.m)
-    up, back = ChannelState(on_air, rng), ChannelState(on_air, rng)
-    state, packets, echoes, began = np.zeros(plant.n), [], [], 0.0
-    taken = np.ones((2, steps))  # in memory from now on
-    loop.start(state)
-    for step in range(steps):
-        if step == steps // 10:
-            began = resident()
-        proposed = plant.u_max * (1.0 if step // 50 % 2 else -1.0)
-        if mode == "monitor":  # which lets it pass: it must not lead out of the box
-            proposed = certificate.K @ loop.estimate
-        start = np.array([time.thread_time(), time.perf_counter()])
-        loop.receive(packets, echoes=echoes)
-        loop.decide(proposed)
-        command = loop.command()
-        taken[:, step] = np.array([time.thread_time(), time.perf_counter()]) - start
-        actuator.receive([command])
-        y = plant.H @ state + plant.sensor_noise.bound.sample_boundary(rng)
-        u = actuator.apply(step)
-        packets = up.carry(rng, step, Packet(step, y))
-        echoes = back.carry(rng, step, actuator.echo)
-        state = plant.A @ state + plant.B @ u + plant.nominal_disturbance.sample_boundary(rng)
-    assert loop.guaranteed, loop.reason
-    return 1e6 * taken, resident() - began
 
 
 def board(names: tuple[str, ...] = ("LaneKeeping", "CSTR", "BatchReactor", "CartPole"), steps: int = 4_000) -> None:
@@ -415,7 +343,7 @@ def _attacked(env: NCSEnv, process: Any, certificate: Any, episodes: int, seed: 
     return first
 
 
-COMMANDS = (cost, decision, loop, board, memory, containment, mismatch)
+COMMANDS = (cost, decision, board, memory, containment, mismatch)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

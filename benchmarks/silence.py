@@ -1,6 +1,6 @@
 """For how many steps the box is kept when the network goes silent: `python -m benchmarks.silence COMMAND`.
 
-Commands: back, ways, attack. All are about registered environments with a contract, of which --ids are names.
+Commands: back, attack. All are about registered environments with a contract, of which --ids are names.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from benchmarks.commands import run, table
+from benchmarks.commands import run
 from benchmarks.random_plants import under_contracts
-from ncs_gym import ChannelContract, LinearPlant, NCSEnv, NCSVectorEnv, TraceChannel
+from ncs_gym import ChannelContract, NCSEnv, NCSVectorEnv, TraceChannel
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
@@ -23,8 +23,6 @@ from shields.silence import OUTAGES, silence_of, way_back
 
 # What the attack is about.
 ATTACKED = ("CartPole", "CartPoleTwoWay", "CartPoleNonlinear", "BatchReactor", "CSTR", "Convoy", "LaneKeeping")
-# Longer ways by a ladder are not looked for.
-LONGEST_LADDER = 10_000
 # Steps of an episode before the network goes silent, and afterwards.
 HEARD, SILENT = 40, 60
 
@@ -74,53 +72,6 @@ def back(ids: Sequence[str] = ()) -> None:
     print(row.format("30 random plants", "1 to 4", "", "", "", *(f"{each:.0f}" for each in np.max(steps, axis=0))))
 
 
-def ways(ids: Sequence[str] = ()) -> None:
-    """Two ways back compared, after outages of 10 contracts.
-
-    An update that is chosen for the way back, which estimators use; and a ladder of multiples of the certified set,
-    each carried into the next by one sample.
-    """
-    print(f"{'':20} {'update for it':>15} {'ladder':>15}")
-    show = table("[steps]", *("each", "rarely") * 2, first=20, width=8)
-
-    def steps_of(plant: LinearPlant, contract: ChannelContract, input_delay: int = 0) -> list[float]:
-        errors, age = certified_error_set(plant, contract), contract.max_age
-        recursion, gaps = ErrorRecursion(plant, contract.quantization_step, errors), (1, age - input_delay + 1)
-        chosen = [way_back(recursion, 10 * age, gap) for gap in gaps]
-        ladder = [by_ladder(recursion, 10 * age, gap) for gap in gaps]
-        return [np.inf if each is None else each for each in chosen] + ladder
-
-    def texts(columns: Sequence[float]) -> list[str]:
-        return ["never" if np.isinf(each) else f"{each:.0f}" for each in columns]
-
-    for name, env, contract in with_contracts(ids):
-        show(name, *texts(steps_of(env.plant, contract, env.downlink_protocol.input_delay)))
-    steps = np.array([steps_of(*each) for each in under_contracts(30)])
-    show("30 random, at most", *texts(np.where(np.isfinite(steps), steps, -np.inf).max(axis=0).tolist()))
-    show("  of these never", *np.isinf(steps).sum(axis=0))
-
-
-def by_ladder(recursion: ErrorRecursion, outage: int, gap: int) -> float:
-    """Returns how many steps a ladder takes: after every sample a multiple of the certified shape is put in its place.
-
-    What happens between two rungs is then known offline. (C2) ends it.
-    """
-    certified = recursion.error_set.shapes[0]
-    inward = np.linalg.inv(np.linalg.cholesky(certified))
-    known = recursion.first
-    for steps in range(1 - outage, LONGEST_LADDER):
-        known = recursion.predicted(known)
-        if steps < 0 or steps % gap:
-            continue
-        updated = recursion.updated(known)
-        assert updated is not None
-        rung = max(float(np.linalg.eigvalsh(inward @ updated[1].shape @ inward.T)[-1]), 1.0)
-        known = updated[1]._replace(shape=rung * certified)
-        if rung == 1.0:
-            return steps
-    return np.inf
-
-
 def attack(ids: Sequence[str] = ATTACKED, envs: int = 64, steps: int = 150) -> None:
     """How often the box is left sooner than `silence_of` says from any belief that the contract allows.
 
@@ -163,7 +114,7 @@ def left_in_silence(name: str, certificate: Certificate, mode: str, count: int, 
     return int(silent), int(left)
 
 
-COMMANDS = (back, ways, attack)
+COMMANDS = (back, attack)
 
 if __name__ == "__main__":
     run(__doc__, COMMANDS)

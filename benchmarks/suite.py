@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.stats import sem, t
 
-from agents.agent_file import AGENT_FILES
+from agents.agent import AGENT_FILES
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import with_changes
 from agents.loop import LoopConfig

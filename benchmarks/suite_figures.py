@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from experiments.plots.figure_style import STYLE, ArmStyle, CaptionedFigure, arm_styles, label, legend_below, thousands
+from experiments.figures import STYLE, ArmStyle, CaptionedFigure, arm_styles, label, legend_below, thousands
 from experiments.runs.loops import AS_TRAINED
 
 ATTACKED = "attacked"

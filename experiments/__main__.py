@@ -64,7 +64,9 @@ def main() -> None:
     except Exception as error:
         if os.environ.get("NCS_DEBUG"):
             raise
-        sys.exit(_complain(_sentence(error), _ERROR))
+        from experiments.terminal import sentence_of
+
+        sys.exit(_complain(sentence_of(error), _ERROR))
 
 
 def parse(arguments: list[str]) -> object:
@@ -132,28 +134,11 @@ def _description(settings: type) -> str:
     return "\n\n".join(wrapped(" ".join(paragraph.split())) for paragraph in text.split("\n\n"))
 
 
-def _sentence(error: Exception) -> str:
-    """Returns an error as one printable line; only unexpected errors show their type."""
-    from ncs_gym.validation import printable
-
-    ours = type(error).__module__.partition(".")[0] == "experiments"
-    if isinstance(error, OSError) and error.strerror:
-        text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
-    elif ours or isinstance(error, (ValueError, OSError, ImportError)):
-        text = str(error)
-    else:
-        text = f"{type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)"
-    return printable(" ".join(text.split()))
-
-
 def _complain(sentence: str, code: int) -> int:
-    """Prints an error on one line, on a terminal on lines of its width, and returns the exit code."""
-    text = f"ncs: {sentence}"
-    if sys.stderr.isatty():
-        from experiments.terminal import wrapped
+    """Prints an error and returns the exit code."""
+    from experiments.terminal import say
 
-        text = wrapped(text, indent=5)
-    print(text, file=sys.stderr, flush=True)
+    say(f"ncs: {sentence}", indent=5)
     return code
 
 

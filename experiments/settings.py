@@ -27,20 +27,14 @@ def _assignments(texts: list[str]) -> dict[str, Any]:
             raise ValueError(f"expected NAME=VALUE, such as gamma=0.99, got {shown(text)}")
         if name in found:
             raise ValueError(f"{name} is given twice")
-        found[name] = _value(name, value)
+        try:
+            found[name] = json.loads(value)
+        except (ValueError, RecursionError):
+            found[name] = value
+            if not re.fullmatch(r"[\w.+-]+", value):
+                form = """a word or a JSON value, such as 0.99, true or '{"net_arch": [64]}'"""
+                raise ValueError(f"expected {name}=VALUE with {form}, got {shown(value)}") from None
     return found
-
-
-def _value(name: str, text: str) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        if not re.fullmatch(r"[\w.+-]+", text):
-            raise ValueError(
-                f"expected {name}=VALUE with a word or a JSON value, such as 0.99, true or '{{\"net_arch\": [64]}}', "
-                f"got {shown(text)}"
-            ) from None
-        return text
 
 
 # Arguments in a form that the parser does not know: `--channel loss=0.5 delay=3`.
@@ -76,16 +70,6 @@ def require_horizon(settings: Any, *modes: str | None) -> None:
     require_limits(settings, horizon=(1, LONGEST_HORIZON))
     if settings.horizon is not None and not any("lookahead" in (mode or "") for mode in modes):
         raise ValueError(f"--horizon {settings.horizon} is for mode lookahead, which is not asked for")
-
-
-def short_version(settings: Any, **budget: Any) -> Any:
-    """Returns the settings of a command's short version if `--smoke` is given, else the same."""
-    if not settings.smoke:
-        return settings
-    default = type(settings).out
-    if settings.out == default:  # what the whole version leaves there stays
-        budget["out"] = default.with_stem(f"{default.stem}-smoke")
-    return replace(settings, **budget)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +152,6 @@ class LearningSettings(BackendSettings):
         hyperparams: Hyperparameters in the words of stable-baselines3, such as gamma=0.99 or
             'policy_kwargs={"net_arch": [64]}'; others are tuned for the environment, or the default.
         lagrangian: How the arm "lagrangian" adapts its penalty per violating step.
-        smoke: Run a short version to see that everything works, by default in a folder with -smoke in its name.
         force: Replace results of other settings in the output folder.
     """
 
@@ -187,7 +170,6 @@ class LearningSettings(BackendSettings):
     channel: Assignments = field(default_factory=dict)
     hyperparams: Assignments = field(default_factory=dict)
     lagrangian: tyro.conf.Suppress[LagrangianSettings] = field(default_factory=LagrangianSettings)
-    smoke: bool = False
     force: bool = False
 
     @property

@@ -1,11 +1,11 @@
-"""What commands show on a terminal: tables, prose, messages beside a progress bar, and warnings as sentences."""
+"""What commands show on a terminal: tables, prose, messages beside a progress bar, errors and warnings as sentences."""
 
 from __future__ import annotations
 
 import shutil
 import sys
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from textwrap import TextWrapper
 from typing import TYPE_CHECKING, Any
@@ -58,6 +58,20 @@ def wrapped(text: str, *, label: str = "", indent: int = 2) -> str:
     return wrapper.fill(text.replace(" %", "\0%")).replace("\0", " ")
 
 
+def sentence_of(error: BaseException) -> str:
+    """Returns an error as one printable line; only unexpected errors show their type."""
+    from ncs_gym.validation import printable
+
+    ours = type(error).__module__.partition(".")[0] == "experiments"
+    if isinstance(error, OSError) and error.strerror:
+        text = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+    elif ours or isinstance(error, (ValueError, OSError, ImportError)):
+        text = str(error)
+    else:
+        text = f"{type(error).__name__}: {error} (NCS_DEBUG=1 shows the traceback)"
+    return printable(" ".join(text.split()))
+
+
 def say(line: str, indent: int = 2) -> None:
     """Prints a message on stderr, above a progress bar; on a terminal in lines of its width."""
     from tqdm import tqdm  # only where there is something to say: `ncs --help` starts sooner
@@ -104,19 +118,6 @@ def warnings_as_sentences() -> Iterator[None]:
             shown.add(text)
             say(f"ncs: warning: {text}", indent=5)
 
-    with _shown_by(show):
-        yield
-
-
-@contextmanager
-def warnings_sent(send: Callable[[str], object]) -> Iterator[None]:
-    """Sends the text of each warning."""
-    with _shown_by(lambda message, *origin, **more: send(str(message))):
-        yield
-
-
-@contextmanager
-def _shown_by(show: Callable[..., object]) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield

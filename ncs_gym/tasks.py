@@ -396,3 +396,7 @@ class SpeedTracking(Task):
 def _entries(task_state: np.ndarray) -> Any:
     """Returns speed and target: of one vehicle as numbers, which are added in a third of the time."""
     return task_state.tolist() if task_state.ndim == 1 else task_state
+
+
+# Settings of these are JSON values.
+TASKS = (Regulation, SpeedTracking, SetpointTracking)

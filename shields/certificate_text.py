@@ -83,15 +83,13 @@ def labeled(label: str, text: str) -> str:
     return textwrap.fill(text, _WIDTH, initial_indent=label, subsequent_indent=indent, break_on_hyphens=False)
 
 
-def contract_text(contract: ChannelContract | None, input_delay: int = 0) -> str:
-    """Returns what the channel has to promise where a downlink takes `input_delay` steps of the contract's age."""
+def contract_text(contract: ChannelContract | None) -> str:
+    """Returns what the channel has to promise."""
     if contract is None:
         return "none: any packets may be lost or late"
     step = contract.quantization_step
     rounding = f"rounded to {step:g} or finer" if step else "not rounded"
-    age = counted(contract.max_age - input_delay, "step")
-    of = f" ({contract.max_age} less the downlink's {input_delay})" if input_delay else ""
-    return f"the newest sample is never older than {age}{of}; samples are {rounding}"
+    return f"the newest sample is never older than {counted(contract.max_age, 'step')}; samples are {rounding}"
 
 
 def provenance_rows(recorded: dict[str, Any]) -> list[tuple[str, str]]:

@@ -108,7 +108,7 @@ def _exit_code() -> int:
 @contextlib.contextmanager
 def without_pictures() -> Iterator[None]:
     """Commands draw their figures and leave files without a picture, which takes most of the time."""
-    with mock.patch("experiments.plots.figure_style.CaptionedFigure.png", b"\x89PNG"):
+    with mock.patch("experiments.figures.CaptionedFigure.png", b"\x89PNG"):
         yield
 
 

@@ -23,18 +23,11 @@ IDS = ("TruckTrailer-v0", "TruckTrailerCruise-v0", "CartPole-v0")
 
 def digest_of(*values: Any) -> str:
     """SHA-256 of values, down to the kinds and bits of numbers and the order of keys."""
-    digest = hashlib.sha256()
-    for value in values:
-        if isinstance(value, dict):
-            value = [part for key, each in value.items() for part in (key, digest_of(each))]
-        if isinstance(value, list | tuple):
-            digest.update(f"{len(value)}".encode() + "".join(map(digest_of, value)).encode())
-        elif isinstance(value, np.ndarray) and value.dtype != object:
-            digest.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
-        else:
-            listed = value.tolist() if isinstance(value, np.ndarray) else value
-            digest.update(f"{type(value).__name__}{listed!r}".encode())
-    return digest.hexdigest()
+
+    def spelled(value: Any) -> Any:
+        return [str(value.dtype), value.shape, value.tolist()]
+
+    return hashlib.sha256(json.dumps(values, default=spelled).encode()).hexdigest()
 
 
 def stepped(env: Any, seed: int, steps: int, shape: tuple[int, ...]) -> str:
@@ -47,25 +40,18 @@ def stepped(env: Any, seed: int, steps: int, shape: tuple[int, ...]) -> str:
     return digest_of(*returned)
 
 
-def scalar_runs(seed: int, steps: int) -> dict[str, str]:
-    """Trajectories of scalar environments, one behind a shield."""
+def stepped_runs(seed: int, steps: int) -> dict[str, str]:
+    """Trajectories of single environments and of vectors, bare and behind a shield."""
     runs = {}
     for name in IDS:
-        changes = {"channel": CHANNEL, "disturbance": "sphere"} if name != "CartPole-v0" else {}
-        runs[name] = stepped(gym.make(f"ncs_gym/{name}", **changes), seed, steps, (1,))
+        changes: dict[str, Any] = {"channel": CHANNEL} if name != "CartPole-v0" else {}
+        one = gym.make(f"ncs_gym/{name}", **changes | ({"disturbance": "sphere"} if changes else {}))
+        runs[name] = stepped(one, seed, steps, (1,))
+        many = gym.make_vec(f"ncs_gym/{name}", num_envs=8, max_episode_steps=20, **changes)
+        runs[f"{name} many"] = stepped(many, seed, steps, (8, 1))
     runs["shield"] = stepped(safety_shield(gym.make(f"ncs_gym/{IDS[1]}")), seed, steps, (1,))
-    return runs
-
-
-def vector_runs(seed: int, steps: int) -> dict[str, str]:
-    """Trajectories of vector environments, one behind a shield."""
-    runs = {}
-    for name in IDS:
-        changes = {"channel": CHANNEL} if name != "CartPole-v0" else {}
-        env = gym.make_vec(f"ncs_gym/{name}", num_envs=8, max_episode_steps=20, **changes)
-        runs[f"{name} many"] = stepped(env, seed, steps, (8, 1))
-    env = vector_shield(gym.make_vec(f"ncs_gym/{IDS[1]}", num_envs=8))
-    return runs | {"shields": stepped(env, seed, steps, (8, 1))}
+    many = vector_shield(gym.make_vec(f"ncs_gym/{IDS[1]}", num_envs=8))
+    return runs | {"shields": stepped(many, seed, steps, (8, 1))}
 
 
 def synthesized() -> dict[str, str]:
@@ -90,7 +76,7 @@ def trained(seed: int, steps: int) -> dict[str, str]:
 
 def seeded(seed: int, steps: int) -> dict[str, str]:
     """All runs that have a seed, by name."""
-    return scalar_runs(seed, steps) | vector_runs(seed, steps) | trained(seed, 16 * steps)
+    return stepped_runs(seed, steps) | trained(seed, 16 * steps)
 
 
 def everything(seed: int, steps: int) -> dict[str, str]:

@@ -52,16 +52,9 @@ def test_docstring_of_a_module_names_its_commands_which_start_without_options(na
         assert asked_for(name, each).replace("_", "-") == each
 
 
-def test_code_is_counted_by_folder_and_data_without_what_is_proved_or_trained(monkeypatch, capsys):
-    monkeypatch.setattr(project, "walked", lambda run: (0, 0))
-    project.complexity()
-    product, others = capsys.readouterr().out.splitlines()[:2]
-    assert re.fullmatch(r"[\d,]+ lines of the product in \d+ modules", product)
-    counts = re.fullmatch(
-        r"([\d,]+) of benchmarks, ([\d,]+) of examples, ([\d,]+) of tests, ([\d,]+) of templates and data", others
-    )
+def test_lines_and_data_are_counted_without_what_is_proved_or_trained():
     folders = [path.read_text().count("\n") for path in (ROOT / "tests").rglob("*.py")]
-    assert int(counts[3].replace(",", "")) == sum(folders)
+    assert project.lines(project.sources("tests")) == sum(folders)
     names = {path.name for path in project.templates_and_data()}
     assert {"comparison.html.j2", "style.css", "ppo.json", "tuned.json", "cart_pole_nonlinear.json"} <= names
     assert not {"agent.json", "CSTR-v0.json"} & names

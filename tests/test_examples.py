@@ -143,7 +143,7 @@ def test_every_example_is_run_here():
     assert {path.name for path in (ROOT / "examples").glob("*.py")} == set(RUNS)
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", sorted(RUNS.keys() - TRAINING - LONG - FOREIGN.keys()))
 def test_example_prints_what_it_is_about(name):
     assert_expected(name, output_of_file(ROOT / "examples" / name, *RUNS[name][0]))

@@ -126,7 +126,7 @@ def test_page_names_what_the_end_of_an_episode_adds():
 def test_actions_of_infos_are_those_that_stand_for_the_inputs(loop):
     env_id, certificate = loop
     env, envs = safety_shield(gym.make(env_id), certificate), vector_shield(gym.make_vec(env_id, 3), certificate)
-    plant, reported = env.unwrapped.plant, [*infos(env, 60, share=1.0), *infos(envs, 60, share=1.0)]
+    plant, reported = env.unwrapped.plant, [*infos(env, 30, share=1.0), *infos(envs, 30, share=1.0)]
     low, high = plant.input_ends
     for info in reported:
         for name in ("applied", "committed"):
@@ -154,13 +154,13 @@ def test_actions_of_infos_move_another_environment_alike_also_where_limits_have_
     shielded, bare = safety_shield(loop_env(**settings)), loop_env(**settings)
     one, other = shielded.reset(seed=3)[1], bare.reset(seed=3)[1]
     changed, rng = 0, np.random.default_rng(0)
-    for _ in range(200):
+    for _ in range(100):
         one = shielded.step(rng.uniform(-1.0, 1.0, 1).astype(np.float32))[4]
         other = bare.step(one["action_applied"])[4]
         np.testing.assert_array_equal(one["state"], other["state"])
         np.testing.assert_array_equal(one["input"], other["input"])
         changed += one["shield_intervened"]
-    assert changed > 20
+    assert changed > 10
 
 
 def spoil(told):
@@ -216,7 +216,7 @@ VECTORS = ["NextStep", "SameStep"]
 FEW = {"num_envs": 3, "max_episode_steps": 5}
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("env_id", registered_ids())
 def test_nobody_changes_an_environment_by_writing_into_what_it_told(env_id):
     assert_tells_what_is_the_listeners_own(lambda: gym.make(env_id))
@@ -224,7 +224,7 @@ def test_nobody_changes_an_environment_by_writing_into_what_it_told(env_id):
         assert_tells_what_is_the_listeners_own(lambda mode=mode: gym.make_vec(env_id, autoreset_mode=mode, **FEW))
 
 
-@pytest.mark.cases(3)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("mode", ["project", pytest.param("monitor", marks=pytest.mark.slow), "lookahead"])
 def test_nobody_changes_a_shield_by_writing_into_what_it_told(loop, mode):
     env_id, certificate = loop

@@ -9,7 +9,7 @@ from gymnasium.wrappers import vector
 from tests.product import safety_shield, vector_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
-SOME = 60
+SOME = 40
 
 SCALAR = {
     "NormalizeObservation": wrappers.NormalizeObservation,

@@ -25,14 +25,14 @@ def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(name):
 
     def counts_of(mode):
         settings = {"plant": plant, "contract": CONTRACT, "channel": CHANNEL} | worst_case(certificate)
-        shield = vector_shield(vector_env(100, **settings), certificate, mode, on_unproved="ignore")
+        shield = vector_shield(vector_env(40, **settings), certificate, mode, on_unproved="ignore")
         return sum(attacked(shield, np.random.default_rng(0)), Counter())
 
     counts = counts_of("project")
-    assert counts["steps"] == 20_000
+    assert counts["steps"] == 8_000
     assert counts["outside S"] == counts["outside box"] == counts["no claim"] == 0
-    assert counts["overridden"] > 1_000
-    assert counts_of("monitor")["outside box"] > 1_000
+    assert counts["overridden"] > 400
+    assert counts_of("monitor")["outside box"] > 400
 
 
 @pytest.mark.slow
@@ -86,6 +86,7 @@ def test_no_controller_bears_a_constant_disturbance_that_no_equilibrium_balances
     assert float(script.impossible_beyond(bounded_by(1.0, [[1.0], [0.0]]), np.zeros(2), 2)) == pytest.approx(3.0)
 
 
+@pytest.mark.slow
 def test_a_rocket_is_refused_for_what_no_controller_can_bear(capsys):
     """A constant gust takes its angle of attack to 1.03 of the limit."""
     script.impossible(("tvc_rocket", "ctms_cruise"))
@@ -93,6 +94,7 @@ def test_a_rocket_is_refused_for_what_no_controller_can_bear(capsys):
     assert printed[1:] == [["tvc_rocket", "0.971"], ["ctms_cruise", "5.500"]]
 
 
+@pytest.mark.slow
 def test_plant_has_a_certificate_with_another_ellipsoid_around_its_first_error():
     """The smallest one around the box of first errors leaves nothing of the limits of the ball and plate."""
     plant, p = script.plant_of("bap_gepoc"), script.published()["bap_gepoc"]
@@ -103,9 +105,8 @@ def test_plant_has_a_certificate_with_another_ellipsoid_around_its_first_error()
         script.certified("bap_gepoc", altered(plant, initial_bound=box))
 
 
-@pytest.mark.parametrize(
-    "name", ["spacecraft", "tvc_rocket", "heli_tondel", pytest.param("propofol", marks=pytest.mark.slow)]
-)
+@pytest.mark.cases(1)
+@pytest.mark.parametrize("name", ["heli_tondel", "spacecraft", "tvc_rocket", "propofol"])
 def test_error_sets_are_found_where_steps_are_short_or_inputs_weak(name):
     """A regulator that had to decay by a quarter in every step weighed errors by 1e8 to 1e11 here."""
     plant, contract = script.plant_of(name), script.contract_of_plant(name)

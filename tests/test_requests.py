@@ -23,7 +23,7 @@ from tests.certificates import certificate_of
 from tests.command import environment
 from tests.product import vector_shield
 
-ID, COUNT, STEPS = "ncs_gym/LaneKeepingOnRequest-v0", 16, 60
+ID, COUNT, STEPS = "ncs_gym/LaneKeepingOnRequest-v0", 12, 44
 
 
 def environments(cost=0.1, **settings):

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.agent import Agent
-from agents.agent_file import AgentError
+from agents.agent import Agent, AgentError
 from agents.loop import LoopConfig
 from agents.training import untrained
 from tests.command import assert_one_sentence, ncs
@@ -48,6 +47,13 @@ def imported(tree):
     return names
 
 
+def dotted(node):
+    """The name of what is called, empty in place of what is no name."""
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return dotted(node.func) if isinstance(node, ast.Call) else getattr(node, "id", "")
+
+
 def dangers(source):
     """Calls and imports in a module's source that could run what a file holds, or reach the network."""
     tree = ast.parse(source)
@@ -55,12 +61,12 @@ def dangers(source):
     found = [name for name in names.values() if name.partition(".")[0] in UNPICKLING | NETWORK]
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
-            first, _, rest = ast.unparse(node.func).partition(".")
+            first, _, rest = dotted(node.func).partition(".")
             called = ".".join(filter(None, [names.get(first, first), rest])).replace("builtins.", "")
-            keywords = {each.arg: ast.unparse(each.value) for each in node.keywords}
+            keywords = {each.arg: getattr(each.value, "value", None) for each in node.keywords}
             keyword, value = SAFE_WITH.get(called, (None, None))
-            unsafe = called in SAFE_WITH and keywords.get(keyword) != str(value)
-            if called in RUNNING or unsafe or keywords.get("shell", "False") != "False":
+            unsafe = called in SAFE_WITH and keywords.get(keyword) is not value
+            if called in RUNNING or unsafe or keywords.get("shell", False) is not False:
                 found.append(called)
             if called.endswith(".load") and called.startswith(
                 ("stable_baselines3.", "sb3_contrib.", "algorithm_class")

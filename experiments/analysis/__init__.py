@@ -1,5 +1,1 @@
-"""From evaluation episodes to confidence intervals and summaries of arms.
-
-Summaries are queries of the long table that `episodes` makes of results, which needs the extra "train"; `statistics`
-does not: `ncs attack` runs without it.
-"""
+"""From evaluation episodes, a long table, to confidence intervals and summaries of arms."""

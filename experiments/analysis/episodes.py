@@ -89,8 +89,8 @@ def arm_summaries(results: Sequence[RunResult], mode: str) -> dict[str, dict[str
     summaries = {}
     for name, runs in by_arm(results).items():
         arm = Arm.of(name, mode)
-        kinds = {"fixed_policy": not arm.differs_from_run_to_run, "filters_training": arm.filters_training}
-        summaries[name] = arm_summary(runs, arm.mode, **kinds)
+        fixed = not arm.differs_from_run_to_run
+        summaries[name] = arm_summary(runs, arm.mode, fixed_policy=fixed, filters_training=arm.filters_training)
     return summaries
 
 

@@ -18,11 +18,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from agents.agent_file import AGENT_FILES
-from experiments.errors import ClusterError, RunError, RunStopped
+from agents.agent import AGENT_FILES
 from experiments.runs.training_run import RunResult, TrainingRun
 from experiments.settings import BackendSettings
-from experiments.terminal import progress_bar, say, warnings_sent
+from experiments.terminal import progress_bar, say, sentence_of
 from shields.documents import write_atomically
 
 # How often the bar moves [s].
@@ -32,14 +31,18 @@ _PERIOD = 0.5
 Engine = tuple[Callable[[int, TrainingRun], Future[tuple[RunResult, list[str]]]], type[Exception]]
 
 
+class RunError(RuntimeError):
+    """A run failed, was stopped, or lost its worker; or the cluster cannot execute it."""
+
+
 def results_of(runs: Sequence[TrainingRun], folder: Path, settings: BackendSettings) -> list[RunResult]:
     """Returns the results of runs of different names, in their order; each is stored when it is finished.
 
     Those whose results are in the folder already are not executed again.
 
     Raises:
-        RunError: If a run fails, which stops the others, or workers died, which costs their own runs only.
-        ClusterError: If a cluster cannot execute the runs.
+        RunError: If a run fails, which stops the others, workers died, which costs their own runs only, or a cluster
+            cannot execute the runs.
         OSError: If the folder cannot be written.
     """
     if len(set(map(file_name, runs))) < len(runs):
@@ -133,8 +136,8 @@ def execute(
                 if isinstance(cause, worker_died):
                     lost.append(run.name)
                 else:
-                    known = isinstance(cause, ClusterError | RunStopped)
-                    raise cause if known else RunError.of(run.name, cause) from error
+                    known = isinstance(cause, RunError)
+                    raise cause if known else RunError(f"run {run.name}: {sentence_of(cause)}") from error
             bar.update(sum(counts[:-1]) - bar.n)
     if lost:
         raise RunError(f"worker processes died in {', '.join(lost)}: the same command goes on with what is missing")
@@ -144,9 +147,9 @@ def executed(
     run: TrainingRun, report: Callable[[int], None], log_folder: Path | None = None
 ) -> tuple[RunResult, list[str]]:
     """Returns the result of a run, and the texts of its warnings; for arguments see `TrainingRun.execute`."""
-    texts: list[str] = []
-    with warnings_sent(texts.append):
-        return run.execute(report, log_folder), texts
+    with warnings.catch_warnings(record=True) as caught:
+        result = run.execute(report, log_folder)
+    return result, [str(each.message) for each in caught]
 
 
 @contextmanager
@@ -202,6 +205,6 @@ def _work(number: int, run: TrainingRun, log_folder: Path | None) -> tuple[RunRe
     def report(steps: int) -> None:
         _counts[number] += steps
         if _counts[-1]:
-            raise RunStopped(f"{run.name} gave up: another run failed, or the user interrupted")
+            raise RunError(f"{run.name} gave up: another run failed, or the user interrupted")
 
     return executed(run, report, log_folder)

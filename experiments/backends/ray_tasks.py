@@ -14,8 +14,7 @@ from typing import Any
 import ray  # pyright: ignore[reportMissingImports]
 from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
-from experiments.backends.execution import Engine, executed
-from experiments.errors import ClusterError
+from experiments.backends.execution import Engine, RunError, executed
 from experiments.runs.provenance import versions
 from experiments.runs.training_run import RunResult, TrainingRun
 
@@ -26,7 +25,7 @@ _SOURCE_FOLDER = Path(__file__).resolve().parents[2]
 
 @contextmanager
 def ray_tasks(address: str) -> Iterator[Engine]:
-    """Yields a cluster, with a core for each run; raises ClusterError if it cannot be joined.
+    """Yields a cluster, with a core for each run; raises RunError if it cannot be joined.
 
     The address "local" starts a Ray that ends with this process, "auto" and HOST:PORT join one.
     """
@@ -42,7 +41,7 @@ def ray_tasks(address: str) -> Iterator[Engine]:
             with chdir(_SOURCE_FOLDER):
                 ray.init(address, **options)
         except (OSError, RuntimeError, ValueError, RayError) as error:
-            raise ClusterError(f"the cluster at --ray-address {address} cannot be joined: {error}") from error
+            raise RunError(f"the cluster at --ray-address {address} cannot be joined: {error}") from error
         task = ray.remote(_on_node).options(num_cpus=1, max_retries=RETRIES, retry_exceptions=False)
 
         def submit(number: int, run: TrainingRun) -> Future[tuple[RunResult, list[str]]]:
@@ -65,5 +64,5 @@ def _on_node(expected: dict[str, str], run: TrainingRun) -> tuple[RunResult, lis
     own = versions()
     if different := sorted(name for name in expected.keys() | own.keys() if expected.get(name) != own.get(name)):
         other = f"node {platform.node()} has another {', '.join(different)} than the driver"
-        raise ClusterError(f"{other}: install the same on every node")
+        raise RunError(f"{other}: install the same on every node")
     return executed(run, lambda steps: None)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
+from scipy.stats import chi2
 
-from experiments.analysis.stalls import broken_contracts, how_often, rate_text
 from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place, write_json
 from experiments.terminal import text_table, wrapped
@@ -51,6 +52,12 @@ class ChannelSettings:
         period = self.sampling_period
         if not (period is None or 0.0 < period < math.inf):
             raise ValueError(f"--sampling-period must be a number > 0, got {period}")
+
+
+# The record is cut into so many parts, into twice as many, and so on, to see how unevenly stalls are spread.
+_FEWEST_PARTS, _MOST_PARTS = 4, 4096
+# Ages of a table: all up to the first, then these of every decade.
+_ALL_UP_TO, _OF_A_DECADE = 10, (2, 5, 10)
 
 
 def channel(settings: ChannelSettings) -> None:
@@ -111,7 +118,7 @@ def _numbers(log: PacketLog, dt: float, asked: list[int]) -> dict[str, Any]:
             f"the record spans one control step of {dt:g} s, a contract needs two: take a longer record or a shorter "
             "step, and write its times in seconds"
         )
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isnan(log.delays).astype(np.int8), [0]])))
+    _, lost_in_a_row = stalls(np.isnan(log.delays), 0)
     return {
         "read_as": log.read_as,
         "disagreement": log.disagreement,
@@ -122,7 +129,7 @@ def _numbers(log: PacketLog, dt: float, asked: list[int]) -> dict[str, Any]:
         "steps_with_a_packet": len(log.sent) - log.left_out(dt),
         "left_out": log.left_out(dt),
         "lost": len(log.sent) - len(arrived),
-        "most_lost_in_a_row": int((edges[1::2] - edges[::2]).max(initial=0)),
+        "most_lost_in_a_row": int(lost_in_a_row.max(initial=0)),
         "delay_quantiles": [float(each) for each in np.quantile(arrived, [0.5, 0.9, 0.99, 1.0])],
         "kept": int(ages.max()),
         "contracts": broken_contracts(ages, dt, asked),
@@ -163,3 +170,73 @@ def _text(log: PacketLog, found: dict[str, Any]) -> str:
 
 def _row(found: dict[str, Any], age: int) -> dict[str, Any]:
     return next(row for row in found["contracts"] if row["max_age"] == age)
+
+
+def stalls(ages: np.ndarray, max_age: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where ages, shape (k,), are larger than `max_age`, and for how long each, shape (stalls,) [steps]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (ages > max_age).astype(np.int8), [0]])))
+    return edges[::2], edges[1::2] - edges[::2]
+
+
+def count_interval(starts: np.ndarray, steps: int) -> tuple[float, float]:
+    """Returns a 95 % interval for the expected number of stalls in a record as long as this one.
+
+    Stalls, which begin at the steps `starts`, shape (n,), come in clusters. The record is cut into 4, 8, 16, ... equal
+    parts, and D is the largest ratio of variance to mean of the numbers of stalls in these parts, at least 1. The n
+    stalls then count as n / D independent clusters of D stalls (quasi-Poisson), for which the interval is Garwood's: D
+    times the quantiles of chi-square with 2 n / D and 2 n / D + 2 degrees of freedom, halved. It assumes that the
+    network goes on as in the record, that clusters are shorter than a quarter of it, and that the record has some of
+    the large ones: of heavy-tailed clusters it needs twenty or more.
+    """
+    spread, parts = 1.0, _FEWEST_PARTS
+    while len(starts) and parts <= min(_MOST_PARTS, steps):
+        counts = np.bincount(starts * parts // steps, minlength=parts)
+        spread, parts = max(spread, float(counts.var(ddof=1) / counts.mean())), 2 * parts
+    clusters = len(starts) / spread
+    low = spread * chi2.ppf(0.025, 2.0 * clusters) / 2.0 if clusters else 0.0
+    return float(low), float(spread * chi2.ppf(0.975, 2.0 * clusters + 2.0) / 2.0)
+
+
+def broken_contracts(ages: np.ndarray, dt: float, also: Collection[int] = ()) -> list[dict[str, Any]]:
+    """Returns how often contracts would have been broken in a record, once for every stall.
+
+    Args:
+        ages: Age of the newest sample at every step, shape (k,) [steps].
+        dt: Duration of a step [s].
+        also: Values of `max_age` that are among them.
+
+    Returns:
+        Rows of JSON values by falling age: all ages up to 10 and some larger ones.
+    """
+    largest, steps = min(int(ages.max()), MAX_AGE), len(ages)
+    decades = (10**power * each for power in (1, 2) for each in _OF_A_DECADE)
+    chosen = {*range(_ALL_UP_TO + 1), *decades, largest, *also}
+    hours = steps * dt / 3600.0
+    rows = []
+    for age in sorted((each for each in chosen if each <= largest or each in also), reverse=True):
+        starts, lengths = stalls(ages, age)
+        rows.append(
+            {
+                "max_age": age,
+                "times": len(starts),
+                "per_hour": len(starts) / hours,
+                "per_hour_ci95": [bound / hours for bound in count_interval(starts, steps)],
+                "longest": int(lengths.max(initial=0)),
+                "broken": float(lengths.sum() / steps),
+            }
+        )
+    return rows
+
+
+def how_often(row: dict[str, Any]) -> str:
+    """Returns how often the newest sample was older than a row of `broken_contracts` allows, as words."""
+    low, high = map(rate_text, row["per_hour_ci95"])
+    if row["times"] == 0:
+        return f"at no time; a record of this length excludes more than {high} times per hour"
+    times = "once" if row["times"] == 1 else f"{row['times']:,} times"
+    return f"{times}, {rate_text(row['per_hour'])} per hour [{low}, {high}]"
+
+
+def rate_text(rate: float) -> str:
+    """Returns a rate in three digits."""
+    return f"{rate:.3g}" if rate < 999.5 else f"{rate:,.0f}"

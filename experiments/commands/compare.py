@@ -8,7 +8,7 @@ from typing import Any
 
 import tyro
 
-from agents.agent_file import pretrained_folders
+from agents.agent import pretrained_folders
 from experiments.analysis.episodes import (
     arm_summaries,
     episodes_table,
@@ -18,15 +18,14 @@ from experiments.analysis.episodes import (
 )
 from experiments.backends.execution import results_of
 from experiments.baselines.controllers import why_aimless
-from experiments.plots.comparison_figures import comparison_figures
-from experiments.report.html import comparison_report
-from experiments.report.text_tables import decimals_of, summary_text
+from experiments.figures import comparison_figures
+from experiments.report import comparison_report, decimals_of, summary_text
 from experiments.runs.arms import Arm, by_arm, full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config, registered_env
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.policies import PRETRAINED
 from experiments.runs.provenance import experiment_provenance
-from experiments.settings import LearningSettings, id_alone, short_version
+from experiments.settings import LearningSettings, id_alone
 from experiments.terminal import say, wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
@@ -53,6 +52,7 @@ class CompareSettings(LearningSettings):
         baselines: Arms that are listed below the others and not drawn.
         scenarios: Other evaluations: worst-case-disturbance, worse-channel, ideal-channel, attacked,
             attacked-on-an-ideal-channel, gaussian (in the documentation under "Experiments").
+        smoke: Run a short version to see that everything works, by default in a folder with -smoke in its name.
         tuned_arms: Whether arms are trained with what was tuned for each by itself (`benchmarks.learning`).
     """
 
@@ -61,6 +61,7 @@ class CompareSettings(LearningSettings):
     arms: tuple[str, ...] = ("unshielded", "penalized", "trusting", "shielded")
     baselines: tuple[str, ...] = ("zero input", "K x_hat", "untrained", "lqr", "lqr+trusting", "lqr+shielded")
     scenarios: tuple[str, ...] = ("as trained",)
+    smoke: bool = False
     tuned_arms: tyro.conf.Suppress[bool] = False
 
 
@@ -124,14 +125,19 @@ def compare(settings: CompareSettings) -> None:
 
 
 def shortened(settings: CompareSettings) -> CompareSettings:
-    """Returns the settings of the short version if `--smoke` is given; see `short_version`."""
-    chosen, default = {}, type(settings)
+    """Returns the settings of the short version if `--smoke` is given, else the same."""
+    if not settings.smoke:
+        return settings
+    chosen: dict[str, Any] = dict(_SMOKE)
+    default = type(settings)
     pair = _SMOKE_PAIR if id_alone(settings.env) in pretrained_folders() else ()
     if settings.arms == default.arms:
         chosen["arms"] = _SMOKE_ARMS + pair
     if settings.baselines == default.baselines and pair:
         chosen["baselines"] = _SMOKE_BASELINES
-    return short_version(settings, **_SMOKE, **chosen)
+    if settings.out == default.out:  # what the whole version leaves there stays
+        chosen["out"] = default.out.with_stem(f"{default.out.stem}-smoke")
+    return replace(settings, **chosen)
 
 
 def _with_full_names(settings: CompareSettings) -> CompareSettings:

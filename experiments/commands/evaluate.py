@@ -11,7 +11,7 @@ import tyro
 from agents import evaluation
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.analysis.episodes import arm_summary
-from experiments.report.text_tables import summary_text
+from experiments.report import summary_text
 from experiments.runs.loops import certificate_of, registered_env, with_channel
 from experiments.runs.output_folder import require_place, write_json
 from experiments.runs.policies import agent_named, certificate_file
@@ -28,8 +28,8 @@ class EvaluateSettings:
     """Evaluates a trained agent, behind a shield or not, on any channel.
 
     Attributes:
-        model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare`, or the output of
-            `ncs train`; or "pretrained", for the agent of --env that comes with the package.
+        model: Folder of a trained agent, such as models/shielded-0 in the output of `ncs compare` and `ncs train`; or
+            "pretrained", for the agent of --env that comes with the package.
         env: Id of the environment the agent was trained in, or module:id.
         shield: Mode of the shield, by default that of the agent's training; "none" for no shield; "monitor" changes
             nothing and counts what it would have done.

@@ -13,9 +13,9 @@ import gymnasium as gym
 import matplotlib
 import numpy as np
 
+from experiments.figures import STYLE, CaptionedFigure
 from experiments.paper.audit import Claim, Verdict, audited_claims, defects
 from experiments.paper.paper_example import PaperExample
-from experiments.plots.figure_style import STYLE, CaptionedFigure
 from experiments.runs.output_folder import claim_folder, write_json, write_results
 from experiments.settings import require_limits
 from experiments.terminal import text_table, wrapped

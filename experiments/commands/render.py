@@ -129,15 +129,13 @@ class _Episode:
 
 def _frames(episodes: list[_Episode], steps: int) -> Iterator[np.ndarray]:
     """Yields the frames of all episodes side by side, at reset and after each step, until all episodes are over."""
+    for _ in tqdm(range(steps), desc="drawing", unit="step", leave=False, disable=None):
+        yield _side_by_side([each.frame() for each in episodes])
+        if all(each.is_over for each in episodes):
+            return
+        for each in episodes:
+            each.step()
     yield _side_by_side([each.frame() for each in episodes])
-    with tqdm(total=steps, desc="drawing", unit="step", leave=False, disable=None) as bar:
-        for _ in range(steps):
-            if all(each.is_over for each in episodes):
-                return
-            for each in episodes:
-                each.step()
-            yield _side_by_side([each.frame() for each in episodes])
-            bar.update()
 
 
 def _side_by_side(frames: list[np.ndarray]) -> np.ndarray:

@@ -10,12 +10,12 @@ import pandas as pd
 
 from experiments.analysis.episodes import arm_summaries, episodes_table, parquet, training_table
 from experiments.backends.execution import results_of
-from experiments.report.text_tables import sweep_table
+from experiments.report import sweep_table
 from experiments.runs.arms import full_names, is_any_trained, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import experiment_provenance
-from experiments.settings import LearningSettings, id_alone, short_version
+from experiments.settings import LearningSettings, id_alone
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
@@ -55,15 +55,8 @@ class SweepSettings(LearningSettings):
                 raise ValueError(f"--channel {name} is a side of the grid: give its values there")
 
 
-# Budget of `--smoke`, which takes the first and the last value of each side of the grid.
-_SMOKE = {"steps": 1_024, "episodes": 4, "seeds": 1}
-
-
 def sweep(settings: SweepSettings) -> None:
     """Runs `ncs sweep`."""
-    sides = {"losses": settings.losses, "delays": settings.delays}
-    ends = {name: tuple(dict.fromkeys((side[0], side[-1]))) for name, side in sides.items()}
-    settings = short_version(settings, **_SMOKE, **ends)
     settings = replace(settings, arms=full_names(settings.arms, settings))
     points = [{"loss": loss, "delay": delay} for loss, delay in product(settings.losses, settings.delays)]
     own = settings.between_samples

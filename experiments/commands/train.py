@@ -7,12 +7,12 @@ from pathlib import Path
 
 from experiments.analysis.episodes import arm_summary
 from experiments.backends.execution import results_of
-from experiments.report.text_tables import summary_text
+from experiments.report import summary_text
 from experiments.runs.arms import Arm, require_arms, run_of_arm
 from experiments.runs.loops import certificate_of, loop_config
 from experiments.runs.output_folder import claim_folder, write_results
 from experiments.runs.provenance import experiment_provenance
-from experiments.settings import LearningSettings, short_version
+from experiments.settings import LearningSettings
 from experiments.terminal import wrapped
 from ncs_gym.validation import counted
 
@@ -30,15 +30,10 @@ class TrainSettings(LearningSettings):
     arm: str = "shielded"
 
 
-# Budget of `--smoke`.
-_SMOKE = {"steps": 4_096, "episodes": 10}
-
-
 def train(settings: TrainSettings) -> None:
     """Runs `ncs train`."""
     if len(settings.algorithms) > 1:
         raise ValueError("--algorithms must be one for `ncs train`: `ncs compare` takes several")
-    settings = short_version(settings, **_SMOKE)
     arm = Arm.of(settings.arm, settings.mode)
     loop = loop_config(settings.env, settings.channel, between_samples=settings.between_samples)
     require_arms(settings, loop, [settings.arm])
@@ -54,11 +49,10 @@ def train(settings: TrainSettings) -> None:
     print(f"{counted(result.train_steps, 'training step')}, {counted(settings.episodes, 'episode')}\n")
     print(summary_text(arms, {}))
     if result.train_steps and not result.train_violation_steps and not result.train_interventions:
-        longer = "leave out --smoke" if settings.smoke else "raise --steps"
         print(
             wrapped(
                 "This training had no violation and no override, so it does not show what the shield is for: "
-                f"{longer}, or run `ncs compare`, which trains with and without the shield."
+                "raise --steps, or run `ncs compare`, which trains with and without the shield."
             )
         )
     print(f"agent: {settings.out / 'models' / run.name}")

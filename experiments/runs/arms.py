@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
+from math import inf
 
-from agents.agent_file import AGENT_FILES, pretrained_folder
+from agents.agent import AGENT_FILES, pretrained_folder
 from agents.hyperparams import ALGORITHMS, with_changes
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines.controllers import CONTROLLERS, REGULATORS, why_aimless
@@ -27,6 +29,9 @@ _KNOWN_ARMS = (
     f"POLICY+FILTER, with FILTER one of shielded[:MODE], lookahead, {', '.join(FILTERS)} and POLICY one of "
     f"{', '.join(_POLICIES)} (modes: {', '.join(_SHIELD_MODES)})"
 )
+
+# Arms whose name may have a weight, and what it is.
+_WEIGHTED = {"penalized": "violation_weight", "lagrangian": "cost_limit"}
 
 # Results of the training runs of each arm, in the order of their indices.
 ResultsByArm = dict[str, Sequence[RunResult]]
@@ -63,7 +68,18 @@ class Arm:
     @classmethod
     def of(cls, name: str, mode: str = "project") -> Arm:
         """Returns the arm of a name, whose spaces may be given as hyphens; raises ValueError if it is unknown."""
-        return _parsed(name, mode)
+        table, spaced = _table(mode), name.replace("-", " ")
+        if spaced in table:
+            return table[spaced]
+        first = spaced.partition(" ")[0]
+        if first in ALGORITHMS and (arm := cls.of(name[len(first) + 1 :], mode)).is_trained and not arm.algorithm:
+            return replace(arm, name=f"{first} {arm.name}", algorithm=first)
+        kind, _, weight = name.partition(":")
+        if kind in _WEIGHTED:
+            with suppress(ValueError):
+                if 0.0 <= (value := float(weight)) < inf:
+                    return replace(table[kind], name=name, **{_WEIGHTED[kind]: value})
+        raise ValueError(f"unknown arm {name!r}; known are {_KNOWN_ARMS}")
 
     @property
     def is_trained(self) -> bool:
@@ -121,45 +137,18 @@ def by_arm(results: Sequence[RunResult]) -> ResultsByArm:
 
 
 @cache
-def _parsed(text: str, mode: str) -> Arm:
-    kind, colon, weight = text.partition(":")
-    if kind == "penalized" and (not colon or _is_weight(weight)):
-        return Arm(text, penalizes_violations=True, violation_weight=float(weight) if colon else None)
-    if kind == "lagrangian" and _is_weight(weight):
-        return Arm(text, penalizes_violations=True, adapts_penalty=True, cost_limit=float(weight))
-    name = text.replace("-", " ")
-    alone = {
-        "unshielded": Arm(name),
-        "monitor": Arm(name, "monitor"),
-        "lagrangian": Arm(name, penalizes_violations=True, adapts_penalty=True),
-        "shield at test": Arm(name, mode, filters_training=False),
-    }
-    if name in alone:
-        return alone[name]
-    algorithm = name.partition(" ")[0]
-    if algorithm in ALGORITHMS and (arm := _parsed(text[len(algorithm) + 1 :], mode)).is_trained and not arm.algorithm:
-        return replace(arm, name=f"{algorithm} {arm.name}", algorithm=algorithm)
-    if name in _POLICIES:
-        return Arm(name, policy=name)
-    modes = {"shielded": mode, "lookahead": "lookahead"} | {f"shielded:{each}": each for each in _SHIELD_MODES}
-    modes |= {each: each for each in FILTERS}
-    if name in modes:
-        return Arm(name, modes[name])
-    if (tested := name.removesuffix(" at test")) != name and tested in modes:
-        return Arm(name, modes[tested], filters_training=False)
-    first, _, last = name.partition("+")
-    if last == "penalty" and first in modes:
-        return Arm(name, modes[first], penalizes_interventions=True)
-    if first in _POLICIES and last in modes:
-        return Arm(name, modes[last], first)
-    raise ValueError(f"unknown arm {text!r}; known are {_KNOWN_ARMS}")
-
-
-def _is_weight(text: str) -> bool:
-    try:
-        return 0.0 <= float(text) < float("inf")
-    except ValueError:
-        return False
+def _table(mode: str) -> dict[str, Arm]:
+    """Returns the arms of one algorithm by name, but for weights in names; `mode` is that of "shielded"."""
+    filters = {"shielded": mode, "lookahead": "lookahead"} | {f"shielded:{each}": each for each in _SHIELD_MODES}
+    filters |= {each: each for each in FILTERS}
+    arms = [Arm("unshielded"), Arm("monitor", "monitor"), Arm("penalized", penalizes_violations=True)]
+    arms += [Arm("lagrangian", penalizes_violations=True, adapts_penalty=True)]
+    arms += [Arm("shield at test", mode, filters_training=False), *(Arm(each, policy=each) for each in _POLICIES)]
+    for name, applied in filters.items():
+        arms += [Arm(name, applied), Arm(f"{name} at test", applied, filters_training=False)]
+        arms += [Arm(f"{name}+penalty", applied, penalizes_interventions=True)]
+        arms += [Arm(f"{each}+{name}", applied, each) for each in _POLICIES]
+    return {arm.name: arm for arm in arms}
 
 
 def require_arms(settings: LearningSettings, loop: LoopConfig, names: Sequence[str]) -> None:

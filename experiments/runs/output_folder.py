@@ -10,7 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from experiments.errors import OtherResultsError
 from experiments.settings import lasting_settings
 from shields.documents import write_atomically
 
@@ -26,14 +25,14 @@ def claim_folder(command: str, settings: Any) -> None:
     """Creates the output folder of a command and writes `settings.json` in it; an earlier summary is removed.
 
     Raises:
-        OtherResultsError: If the folder holds results of other settings, or a `settings.json` of something else, and
+        ValueError: If the folder holds results of other settings, or a `settings.json` of something else, and
             the settings do not `force` it.
         OSError: If the folder cannot be written.
     """
     folder = settings.out
     content = {"command": command, "settings": lasting_settings(settings)}
     if not settings.force and (problem := _problem(folder, content)):
-        raise OtherResultsError(f"{folder} holds {problem}: give another --out, or --force to replace it")
+        raise ValueError(f"{folder} holds {problem}: give another --out, or --force to replace it")
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "summary.json").unlink(missing_ok=True)
     write_json(folder / "settings.json", content)

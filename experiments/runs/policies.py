@@ -4,26 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from agents.agent_file import AgentError, pretrained_folder
+from agents.agent import Agent, AgentError, pretrained_folder
 from experiments.baselines.controllers import REGULATORS, controller
 from experiments.baselines.tuned import tuned_weights
 from experiments.terminal import say
 from ncs_gym import NCSEnv
 from shields.certificate import Fallback
 
-if TYPE_CHECKING:
-    from agents.agent import Agent
-
 # Controllers that need neither training nor a certificate.
 _UNTRAINED = ("zero input", "random", *REGULATORS)
 # Stands for the agent of the environment that comes with the package.
 PRETRAINED = "pretrained"
-# Agents that a message names.
-_MOST_LISTED = 4
 
 # Maps an observation, shape (entries,), and its info to an action, shape (m,).
 Policy = Callable[[np.ndarray, dict], np.ndarray]
@@ -34,7 +28,7 @@ def policy_by_name(name: str, env_id: str, env: NCSEnv, seed: int) -> Policy:
 
     Raises:
         AgentError: If there is no agent for this environment.
-        ValueError: If the folder of a run holds several agents.
+        ValueError: If there is no such policy, file or folder.
     """
     if (untrained := name.replace("-", " ")) in _UNTRAINED:
         nothing = Fallback.of_gain(np.zeros((env.plant.m, env.plant.n)))
@@ -58,34 +52,17 @@ def agent_named(name: str, env_id: str | None) -> tuple[Agent, Path]:
 
     Raises:
         AgentError: If there is no agent, or it is of another environment.
-        ValueError: If the folder of a run holds several agents, or nothing says of which environment the agent is.
+        ValueError: If nothing says of which environment the agent is.
     """
-    from agents import Agent  # imports torch, or says what to install
-
-    path = _only_agent(Path(name))
-    if name != PRETRAINED and not path.exists():
-        raise ValueError(f"no agent in {name}: there is no such file or folder")
-    if env_id is None and name == PRETRAINED:
-        raise ValueError(f"{name} does not say of which environment the agent is: give --env")
-    if env_id is not None and name == PRETRAINED:
+    path = Path(name)
+    if name == PRETRAINED:
+        if env_id is None:
+            raise ValueError(f"{name} does not say of which environment the agent is: give --env")
         path = pretrained_folder(env_id)
     agent = Agent.load(path)
     if env_id not in (None, agent.env):
         raise AgentError(f"the agent in {path} was trained in {agent.env}, not in {env_id}")
     return agent, path
-
-
-def _only_agent(folder: Path) -> Path:
-    """Returns the folder of the only agent in a run's output; any other folder is returned as it is."""
-    models = sorted(file.parent for file in folder.glob("models/*/agent.json"))
-    if (folder / "agent.json").exists() or not models:
-        return folder
-    if len(models) > 1:
-        names = ", ".join([*(model.name for model in models[:_MOST_LISTED]), *["..."] * (len(models) > _MOST_LISTED)])
-        raise ValueError(
-            f"{folder} holds {len(models)} agents: give the folder of one, in {folder / 'models'} ({names})"
-        )
-    return models[0]
 
 
 def certificate_file(agent: Path) -> Path | None:

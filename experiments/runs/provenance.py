@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from cloudpickle import dumps
 
-from agents.agent_file import installed_versions
+from agents.agent import installed_versions
 from agents.loop import LoopConfig
 from experiments.settings import LearningSettings, id_alone, lasting_settings
 from ncs_gym.envs.env import ncs_env
@@ -29,18 +29,16 @@ _SOURCE_PACKAGES = ("ncs_gym", "shields", "agents", "experiments")
 
 @cache
 def versions() -> dict[str, str]:
-    """Returns the versions of the installed packages that results depend on, and a digest of this project's source."""
-    return installed_versions(_DEPENDENCIES) | {"source": _source_digest()}
+    """Returns the versions of the installed packages that results depend on, and a digest of this project's source.
 
-
-def _source_digest() -> str:
-    """Returns a SHA-256 over the source of the four packages; the registered environments are code, too."""
+    The registered environments are source, too.
+    """
     root = Path(__file__).resolve().parents[2]
     files = sorted(path for package in _SOURCE_PACKAGES for path in (root / package).rglob("*.py"))
     digest = hashlib.sha256()
     for path in files:
         digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
+    return installed_versions(_DEPENDENCIES) | {"source": digest.hexdigest()}
 
 
 def module_digest(module: str) -> str:

@@ -7,10 +7,11 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from agents.agent import Agent
 from agents.evaluation import Policy, evaluate
 from agents.hyperparams import rollout_steps
 from agents.loop import LoopConfig
@@ -24,9 +25,6 @@ from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
 from shields import Certificate
 from shields.documents import digest
-
-if TYPE_CHECKING:
-    from agents.agent import Agent
 
 
 @dataclass(frozen=True)
@@ -150,41 +148,30 @@ class TrainingRun:
         """Returns the result; only TensorBoard's events are written."""
         if self.module:
             import_module(self.module)
-        trained = None
+        agent, counts, history, files = None, (0, 0, 0), [], {}
         if self.trains:
-            from agents.training import (
-                train,  # imports torch, which the process that only collects results does without
-            )
+            from agents import train  # imports torch, which the process that collects results does without
 
             logs = log_folder and log_folder / self.name
             if logs is not None:
                 shutil.rmtree(logs, ignore_errors=True)
-            trained = train(
-                self.training_loop,
-                self.steps,
-                self.training_seed,
-                self.algorithm,
-                self.settings,
-                log_folder=logs,
-                on_progress=on_progress,
-            )
-        agent = trained.agent if trained else _agent_of(self)
+            given = self.training_loop, self.steps, self.training_seed, self.algorithm, self.settings
+            trained = train(*given, log_folder=logs, on_progress=on_progress)
+            counts = trained.steps, trained.violation_steps, trained.interventions
+            agent, history, files = trained.agent, trained.history, trained.agent.files()
+        elif self.agent_files:
+            agent = Agent.of_files(self.agent_files)
+        elif self.policy_kind == "untrained":
+            from agents import untrained
+
+            agent = untrained(self.loop, self.training_seed, self.algorithm, self.settings)
         safe_set, played = self.certificate.polytope or self.certificate.M, {}
         for name in (AS_TRAINED, *self.scenarios):
             loop, policy = under(name, self.loop), _policy(self, agent)  # a random policy begins anew each time
             found = evaluate(loop, policy, self.episodes, self.evaluation_seed, safe_set, on_progress)
             played[name] = found.episodes
-        return RunResult(
-            arm=self.arm,
-            index=self.index,
-            train_steps=trained.steps if trained else 0,
-            train_violation_steps=trained.violation_steps if trained else 0,
-            train_interventions=trained.interventions if trained else 0,
-            history=trained.history if trained else [],
-            episodes=played.pop(AS_TRAINED),
-            files=trained.agent.files() if trained else {},
-            scenarios=played,
-        )
+        own = played.pop(AS_TRAINED)
+        return RunResult(self.arm, self.index, *counts, history, own, files=files, scenarios=played)
 
     def _seeds(self) -> list[int]:
         """Returns two 31-bit numbers that depend on the experiment's seed and the run's index, not on the arm."""
@@ -199,19 +186,6 @@ def _described(loop: LoopConfig, certificate: str) -> dict[str, Any]:
     for name in ("observed", "lagrangian"):
         values[name] = values[name] and [type(values[name]).__name__, vars(values[name])]
     return values
-
-
-def _agent_of(run: TrainingRun) -> Agent | None:
-    """Returns the agent that a run does not train: that of its files, one with initial weights, or None."""
-    if run.agent_files:
-        from agents.agent import Agent  # imports torch
-
-        return Agent.of_files(run.agent_files)
-    if run.policy_kind != "untrained":
-        return None
-    from agents.training import untrained
-
-    return untrained(run.loop, run.training_seed, run.algorithm, run.settings)
 
 
 def _policy(run: TrainingRun, agent: Agent | None) -> Policy:

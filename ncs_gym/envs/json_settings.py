@@ -20,7 +20,7 @@ from ncs_gym.processes.cart_pole_process import CartPoleProcess
 from ncs_gym.processes.gym_pendulum import PendulumProcess
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
 from ncs_gym.processes.process import FamilyProcess, LinearProcess
-from ncs_gym.tasks import Regulation, SetpointTracking, SpeedTracking
+from ncs_gym.tasks import TASKS
 from ncs_gym.uncertainty.disturbances import (
     AdversarialDisturbance,
     BallDisturbance,
@@ -34,7 +34,7 @@ from ncs_gym.validation import shown
 # What a dictionary of fields stands for in these settings; several classes are told apart by the names of their fields.
 JSON_SETTINGS: dict[str, tuple[type, ...]] = {
     "channel": (Channel,),
-    "task": (Regulation, SpeedTracking, SetpointTracking),
+    "task": TASKS,
     "disturbance": (BoxDisturbance, SinusoidDisturbance),
     "initial_set": (Ellipsoid,),
     "contract": (ChannelContract,),

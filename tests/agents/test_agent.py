@@ -7,11 +7,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.agent import Agent, Normalization
-from agents.agent_file import AgentError
+from agents.agent import Agent, AgentError, Normalization
 from agents.hyperparams import with_changes
 from agents.loop import LoopConfig, ShieldSettings
-from agents.training import train
+from agents.training import train, untrained
 from ncs_gym import Channel, GilbertElliott, truck_trailer
 from shields import Certificate, verify
 from tests.certificates import certificate_of
@@ -21,14 +20,14 @@ from tests.plants import small
 CRUISE, LINEAR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/LinearNCS-v0"
 OBSERVATIONS = np.random.default_rng(0).standard_normal((50, 3))
 SETTINGS = {
-    "PPO": dict(n_envs=4, n_steps=64, batch_size=128, n_epochs=2, policy_kwargs=dict(net_arch=[16, 16])),
+    "PPO": dict(n_envs=4, n_steps=64, batch_size=128, n_epochs=1, policy_kwargs=dict(net_arch=[16, 16])),
     "TD3": dict(n_envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64)
     | dict(policy_kwargs=dict(net_arch=[16, 16])),
 }
 
 
 def trained(algorithm="PPO", channel=None):
-    return train(LoopConfig(env=CRUISE, kwargs={"channel": channel}), 512, 1, algorithm, SETTINGS[algorithm]).agent
+    return train(LoopConfig(env=CRUISE, kwargs={"channel": channel}), 256, 1, algorithm, SETTINGS[algorithm]).agent
 
 
 def change(folder, **values):
@@ -93,7 +92,7 @@ def test_folder_keeps_how_the_environment_was_made(tmp_path):
     certificate = certificate_of(env.plant, env.certificate_contract)
     shield = ShieldSettings(certificate, "lookahead", horizon=3)
     loop = LoopConfig(env=CRUISE, kwargs=kwargs, shield=shield)
-    agent = train(loop, 64, 0, hyperparams={"n_envs": 2, "n_steps": 32, "batch_size": 32}).agent
+    agent = untrained(loop, 0)
     agent.save(tmp_path, shield)
     again = Agent.load(tmp_path)
     assert again.env_kwargs == agent.env_kwargs
@@ -115,7 +114,7 @@ def test_folder_keeps_a_plant_without_an_id(tmp_path, as_file):
     plant.save(tmp_path / "plant.json")
     loop = LoopConfig(env=LINEAR, kwargs={"plant": tmp_path / "plant.json" if as_file else plant})
     shield = ShieldSettings(certificate_of(plant))
-    agent = train(replace(loop, shield=shield), 64, 0, hyperparams={"n_envs": 2, "n_steps": 32, "batch_size": 32}).agent
+    agent = untrained(replace(loop, shield=shield), 0)
     agent.save(folder, shield)
     (tmp_path / "plant.json").unlink()  # the folder is all that is needed
     again = Agent.load(folder)
@@ -142,7 +141,7 @@ def test_training_whose_agent_cannot_be_saved_is_told_so_before_it(tmp_path):
     with pytest.warns(UserWarning, match="the agent cannot be saved: files of agents do not keep autoreset_mode"):
         train(loop, 32, 0, hyperparams=small)
     loop = LoopConfig(env=CRUISE, kwargs={"max_episode_steps": 50})
-    train(loop, 32, 0, hyperparams=small).agent.save(tmp_path)
+    untrained(loop, 0).save(tmp_path)
     assert Agent.load(tmp_path).env_kwargs["max_episode_steps"] == 50
 
 

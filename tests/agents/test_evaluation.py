@@ -14,6 +14,7 @@ from shields.synthesis.polytope_certificates import with_polytope
 from tests.certificates import certificate_of
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
+SHORT = CRUISE.with_kwargs(max_episode_steps=50)
 
 
 def zero(observations, infos):
@@ -69,9 +70,9 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
 
 def test_environments_without_a_vector_one_are_played_alike(scalar, shield):
     for loop in (scalar, LoopConfig(env=scalar.env, shield=shield)):
-        played = evaluate(loop, throttle, 4, 0, shield.certificate.M)
+        played = evaluate(loop.with_kwargs(max_episode_steps=60), throttle, 2, 0, shield.certificate.M)
         shielded = loop.shield is not None
-        assert [record.steps for record in played.episodes] == [200] * 4
+        assert [record.steps for record in played.episodes] == [60] * 2
         assert all((record.violation_steps == 0) == shielded for record in played.episodes)
         assert all(record.guaranteed == shielded for record in played.episodes)
 
@@ -79,7 +80,7 @@ def test_environments_without_a_vector_one_are_played_alike(scalar, shield):
 def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):
     penalized = replace(shield, penalty=1.0)
     free, other = (
-        evaluate(LoopConfig(env=CRUISE.env, shield=each, violation_penalty=each.penalty), throttle, 3, 0, np.eye(2))
+        evaluate(replace(SHORT, shield=each, violation_penalty=each.penalty), throttle, 3, 0, np.eye(2))
         for each in (shield, penalized)
     )
     assert free.episodes == other.episodes
@@ -88,10 +89,9 @@ def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):
 
 def test_steps_that_were_proved_are_counted_where_the_contract_breaks():
     infos = []
-    settings = {"mode": "lookahead", "on_unproved": "ignore"}
     channel = Channel(loss=0.8, max_consecutive_losses=30)
     env = gym.make("ncs_gym/CartPole-v0").unwrapped
-    shield = ShieldSettings(certificate_for(env.plant, env.certificate_contract), **settings)
+    shield = ShieldSettings(certificate_for(env.plant, env.certificate_contract), on_unproved="ignore")
     loop = LoopConfig(env="ncs_gym/CartPole-v0", kwargs={"channel": channel, "max_episode_steps": 80}, shield=shield)
 
     def noting(observations, info):
@@ -115,10 +115,10 @@ def test_levels_are_those_of_the_set_that_the_shield_keeps(certificate, loaded):
 
 
 def test_arms_have_common_random_numbers(shield):
-    bare = evaluate(CRUISE, zero, 5, 7).episodes
-    shielded = evaluate(LoopConfig(env=CRUISE.env, shield=shield), zero, 5, 7).episodes
+    bare = evaluate(SHORT, zero, 5, 7).episodes
+    shielded = evaluate(replace(SHORT, shield=shield), zero, 5, 7).episodes
     assert [record.episode_return for record in bare] == [record.episode_return for record in shielded]
-    others = evaluate(CRUISE, zero, 5, 8).episodes
+    others = evaluate(SHORT, zero, 5, 8).episodes
     assert not {record.episode_return for record in bare} & {record.episode_return for record in others}
 
 

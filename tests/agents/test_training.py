@@ -17,7 +17,7 @@ from tests.certificates import certificate_of
 from tests.product import safety_shield
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
-TINY = dict(n_envs=4, n_steps=64, batch_size=128, n_epochs=2)
+TINY = dict(n_envs=4, n_steps=64, batch_size=128, n_epochs=1)
 TINY_REPLAY = dict(n_envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64)
 OBSERVATIONS = np.random.default_rng(0).standard_normal((20, 3))
 
@@ -42,6 +42,8 @@ def test_same_seed_trains_the_same_agent():
     np.testing.assert_array_equal(actions_of(first), actions_of(second))
     assert [point.violation_steps for point in first.history] == [point.violation_steps for point in second.history]
     assert (actions_of(trained(seed=4)) != actions_of(first)).any()
+    start, again = (untrained(CRUISE, 3, hyperparams=TINY) for _ in range(2))
+    assert start.checksum == again.checksum != first.agent.checksum  # a single rollout is learned from
 
 
 def test_training_counts_every_violating_step(monkeypatch):
@@ -57,8 +59,8 @@ def test_training_counts_every_violating_step(monkeypatch):
 
     make_vec, reported = gym.make_vec, []
     monkeypatch.setattr(gym, "make_vec", lambda *arguments, **keywords: Counter(make_vec(*arguments, **keywords)))
-    result = train(CRUISE, 1024, 0, hyperparams=TINY, on_progress=reported.append)
-    assert result.steps == len(counted) == sum(reported) == 1024
+    result = train(CRUISE, 512, 0, hyperparams=TINY, on_progress=reported.append)
+    assert result.steps == len(counted) == sum(reported) == 512
     assert result.violation_steps == sum(counted) > 0
     assert result.history[-1].violation_steps == result.violation_steps
     assert result.interventions == 0
@@ -93,20 +95,13 @@ def test_every_algorithm_trains_counts_and_repeats_itself(algorithm, settings, a
         np.testing.assert_array_equal(actions_of(first), actions_of(second))
 
 
-def test_a_single_rollout_is_learned_from():
-    agent, start = train(CRUISE, 256, 0, hyperparams=TINY).agent, untrained(CRUISE, 0, hyperparams=TINY)
-    assert agent.checksum != start.checksum
-    np.testing.assert_array_equal(start.act(OBSERVATIONS), untrained(CRUISE, 0, hyperparams=TINY).act(OBSERVATIONS))
-
-
 def test_rate_falls_from_its_full_value_to_that_of_the_last_rollout_unless_it_is_constant():
-    schedule = train(CRUISE, 4 * 256, 0, hyperparams=TINY).agent.model.lr_schedule
-    expected = [0.003 * fraction for fraction in (1.0, 0.75, 0.5, 0.25)]
-    assert [schedule(remaining) for remaining in (0.75, 0.5, 0.25, 0.0)] == pytest.approx(expected)
     constant, falling = (
-        train(CRUISE, 512, 3, hyperparams=TINY | rate).agent for rate in ({"learning_rate": 0.003}, {})
+        train(CRUISE, 4 * 256, 0, hyperparams=TINY | rate).agent for rate in ({"learning_rate": 0.003}, {})
     )
-    assert [each.model.lr_schedule(0.5) for each in (constant, falling)] == pytest.approx([0.003, 0.003])
+    expected = [0.003 * fraction for fraction in (1.0, 0.75, 0.5, 0.25)]
+    assert [falling.model.lr_schedule(remaining) for remaining in (0.75, 0.5, 0.25, 0.0)] == pytest.approx(expected)
+    assert constant.model.lr_schedule(0.5) == pytest.approx(0.003)
     assert constant.checksum != falling.checksum
 
 
@@ -198,6 +193,7 @@ def test_what_the_library_takes_is_not_refused():
     require_trainable(CRUISE, 100_000, "SAC", {"ent_coef": 0.1, "noise_std": 0.1})
 
 
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("order", [1, -1], ids=["bare first", "shielded first"])
 def test_overrides_are_counted_where_only_some_environments_have_a_shield(order, certificate):
     makes = [lambda: gym.make(CRUISE.env), lambda: safety_shield(gym.make(CRUISE.env), certificate)]

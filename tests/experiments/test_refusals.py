@@ -13,6 +13,7 @@ from experiments.commands.attack import AttackSettings
 from experiments.commands.channel import ChannelSettings
 from experiments.commands.compare import CompareSettings
 from experiments.commands.sweep import SweepSettings
+from experiments.commands.train import TrainSettings, train
 from experiments.runs.arms import Arm
 from experiments.runs.loops import changed_channel, scenario_named, worse_channel
 from experiments.settings import BackendSettings
@@ -29,6 +30,7 @@ SETTINGS = [
     *((CompareSettings, {name: value}, f"--{name.replace('_', '-')} must be")
       for name, value in {"seeds": 0, "steps": -1, "episodes": 0, "seed": -1, "intervention_penalty": -0.1,
                           "violation_penalty": np.inf}.items()),
+    *((CompareSettings, {"algorithms": names}, "--algorithms must be different") for names in ((), ("SAC", "SAC"))),
     (CompareSettings, {"horizon": 0, "mode": "lookahead"}, f"{HORIZON} 0"),
     (CompareSettings, {"horizon": 51, "arms": ("lookahead",)}, f"{HORIZON} 51"),
     *((ChannelSettings, {"file": "f"} | given, "give --certificate and --plant, or --env")
@@ -49,6 +51,7 @@ ARMS += ["lqr+monitored", "shielded+residual", "+shielded", "K x_hat+K x_hat", "
 CALLS = [
     *(((Arm.of, name), "unknown arm .*known are unshielded") for name in ARMS),
     ((scenario_named, "worse"), "unknown scenario 'worse'; known are as trained, worst-case disturbance"),
+    ((train, TrainSettings(algorithms=("PPO", "SAC"))), "--algorithms must be one for `ncs train`"),
     ((worse_channel, Channel(), ChannelContract(max_age=0)), "no channel within the contract is worse"),
     ((best_period, Channel(0.5), ChannelContract(3)), "any number of packets"),
     ((changed_channel, Channel(), {"lag": 3}), "--channel lag: a channel has no such setting; known are loss"),
@@ -93,7 +96,7 @@ ONE_SENTENCE = [
     ("synthesize --env ncs_gym:CartPole-v1", "expected an NCSEnv inside", "ncs_gym.Networked puts a network"),
     ("render --out a.avi", "--out must end in .gif or .png"),
     ("render --policy nowhere", "no policy nowhere:", "those with a name are zero input, random, lqr"),
-    ("evaluate nofile.zip", "no agent in nofile.zip: there is no such file or folder"),
+    ("evaluate nofile.zip", "no agent in nofile.zip: cannot read agent.json"),
 ]  # fmt: skip
 
 # Known without a certificate, which may take minutes.

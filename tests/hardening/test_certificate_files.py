@@ -102,7 +102,7 @@ def judged(content, plant, path):
 
 
 @given(data=st.data())
-@examples(60)
+@examples(30)
 def test_certificates_forged_at_random_are_refused_or_true(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "forged.json"
     plant, certificate = case(data.draw(st.sampled_from(CASES)))

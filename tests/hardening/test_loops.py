@@ -69,7 +69,7 @@ def pair(kind, certificate, loaded):
 
 @pytest.mark.parametrize("kind", ["scalar", "vector", "shield", "vector shield"])
 @given(moves=MOVES)
-@examples(6)
+@examples(4)
 def test_refused_actions_and_resets_move_nothing(kind, certificate, loaded, moves):
     (one, other), count = pair(kind, certificate, loaded)
     good = [move for move in moves if not move[0].startswith("bad")]

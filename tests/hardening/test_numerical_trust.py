@@ -71,7 +71,7 @@ def test_a_shield_holds_in_whatever_units(seed):
     env = safety_shield(loop_env(plant, Channel(0.5), disturbance="adversarial"), certificate)
     env.reset(seed=seed)
     rng, interventions = np.random.default_rng(seed), 0
-    for _ in range(150):
+    for _ in range(60):
         *_, info = env.step(np.sign(rng.uniform(-1.0, 1.5, 2)).astype(np.float32))
         interventions += info["shield_intervened"]
         assert info["shield_guaranteed"]

@@ -102,7 +102,7 @@ def test_verdicts_are_true_in_any_order_of_summation(name):
     orders = [np.arange(plant.n), np.arange(plant.n)[::-1], rng.permutation(plant.n)]
     filters = [safety_filter(*reordered(certificate, plant, order)) for order in orders]
     passed = 0
-    for _ in range(60):
+    for _ in range(30):
         direction = rng.standard_normal(plant.n)
         direction /= certificate.safe_set.gauge(direction)
         u, low, high = rng.uniform(-1.0, 1.0, plant.m) * plant.u_max, 0.0, 2.0
@@ -116,7 +116,7 @@ def test_verdicts_are_true_in_any_order_of_summation(name):
             if decision.reason == "safe":
                 passed += 1
                 assert is_inside_exactly(certificate, plant, x_hat, shape, u)
-    assert passed >= 60
+    assert passed >= 30
 
 
 def reordered(certificate, plant, order):

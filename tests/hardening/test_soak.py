@@ -55,8 +55,8 @@ def forgotten(monkeypatch):
 
 
 def test_a_long_run_does_not_grow(loaded):
-    assert growth(many(loaded, 64), 800, 500) < MOST_GROWTH
-    assert growth(loop_env(loaded, CHANNEL), 1500, 700) < MOST_GROWTH
+    assert growth(many(loaded, 32), 650, 400) < MOST_GROWTH
+    assert growth(loop_env(loaded, CHANNEL), 1200, 600) < MOST_GROWTH
 
 
 @pytest.mark.slow

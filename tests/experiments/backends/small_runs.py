@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.errors import RunStopped
+from experiments.backends.execution import RunError
 from experiments.runs.training_run import RunResult
 from tests.experiments.results import run
 
@@ -45,7 +45,7 @@ class Small:
             while self.does == "wait":
                 time.sleep(0.01)
                 on_progress(0)
-        except RunStopped:
+        except RunError:
             (self.folder / f"{self.name} gave up").touch()
             raise
         warnings.warn(f"{self.name} warns", stacklevel=1)

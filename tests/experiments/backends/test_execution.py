@@ -9,8 +9,7 @@ import time
 import pytest
 
 from experiments.backends import execution
-from experiments.backends.execution import results_of
-from experiments.errors import RunError, RunStopped
+from experiments.backends.execution import RunError, results_of
 from experiments.settings import BackendSettings
 from tests.command import children_of, environment, is_alive
 from tests.experiments.backends.small_runs import Small
@@ -74,7 +73,7 @@ def test_dead_worker_costs_its_own_run_only(tmp_path):
 def test_a_run_told_to_stop_gives_up_at_its_next_report(certificate, monkeypatch):
     endless = training_run(certificate, steps=0, episodes=10_000_000)
     monkeypatch.setattr(execution, "_counts", [0, 1])
-    with pytest.raises(RunStopped, match="zero-input-0"):
+    with pytest.raises(RunError, match="zero-input-0"):
         execution._work(0, endless, None)
 
 

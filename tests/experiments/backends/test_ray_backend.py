@@ -14,9 +14,8 @@ import pytest
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[ray]'")
 
-from experiments.backends.execution import results_of  # noqa: E402
+from experiments.backends.execution import RunError, results_of  # noqa: E402
 from experiments.backends.ray_tasks import RETRIES, _on_node  # noqa: E402
-from experiments.errors import ClusterError, RunError  # noqa: E402
 from experiments.runs.provenance import versions  # noqa: E402
 from experiments.settings import BackendSettings  # noqa: E402
 from tests.command import environment, is_alive, ncs_process  # noqa: E402
@@ -141,7 +140,7 @@ def test_worker_that_always_dies_is_given_up_and_named(tmp_path):
 
 
 def test_node_with_another_source_is_refused_in_one_sentence():
-    with pytest.raises(ClusterError, match=r"node .* has another source than the driver: install the same on every"):
+    with pytest.raises(RunError, match=r"node .* has another source than the driver: install the same on every"):
         _on_node(versions() | {"source": "other"}, None)
 
 

@@ -112,7 +112,7 @@ def nominal(env, name, weights):
     return reached
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("env_id", ["ncs_gym/LaneKeeping-v0", "ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0"])
 def test_mpc_keeps_limits_and_margins_that_the_regulator_leaves(env_id):
     env, weights = env_of(env_id), RegulatorWeights(1e-3, 0.0)
@@ -162,7 +162,7 @@ def test_actions_stand_for_inputs_between_both_ends(name):
         np.testing.assert_allclose(u, np.clip(wanted, *plant.input_ends), atol=1e-12)
 
 
-@pytest.mark.cases(2)
+@pytest.mark.cases(1)
 @pytest.mark.parametrize("name", ["mpc", "mpc:20"])
 @pytest.mark.parametrize("target", [-4.0, 4.0])
 def test_mpc_comes_close_to_both_ends_and_no_further(name, target):

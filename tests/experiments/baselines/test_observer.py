@@ -49,7 +49,7 @@ def offset(env, name, steps=250):
     return abs(np.mean(errors[-50:])) / 0.2
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("plant", PLANTS)
 @pytest.mark.parametrize("name", ["lqr", "mpc"])

@@ -120,20 +120,19 @@ def test_finished_study_is_not_overwritten(command, smoke):
 
 def test_saved_agent_is_evaluated(smoke, tmp_path):
     model = smoke[0] / "models" / "unshielded-0"
-    run = succeeded("evaluate", model, "--shield", "project", "--episodes", "5", "--out", tmp_path / "e.json")
-    arm = json.loads((tmp_path / "e.json").read_text())["arms"]["shield: project"]
+    given = ("--shield", "project", "--episodes", "5", "--channel", "loss=0.9", "--out", tmp_path / "e.json")
+    run = succeeded("evaluate", model, *given)
+    left = json.loads((tmp_path / "e.json").read_text())
+    arm = left["arms"]["shield: project"]
     assert (arm["eval_episodes"], arm["eval_violation_steps"], arm["guaranteed_episodes"]) == (5, 0, 5)
+    assert (left["channel"]["loss"], left["channel"]["delay"]) == (0.9, 2)
     assert ", 5 episodes" in run.stdout
     assert " 0.0 [0.0, 52.2] " in run.stdout
-    succeeded("evaluate", model, "--episodes", "5", "--channel", "loss=0.9", "--out", tmp_path / "f.json")
-    worse = json.loads((tmp_path / "f.json").read_text())
-    assert worse["channel"]["loss"] == 0.9
-    assert worse["channel"]["delay"] == 2
-    assert set(worse["arms"]) == {"shield: none"}
 
 
 def test_one_agent_is_trained(tmp_path, without_workers):
-    run = succeeded("train", "--algorithms", "A2C", "--steps", "256", "--episodes", "3", "--out", tmp_path / "one")
+    small = ("--steps", 64, "--episodes", 2, "--hyperparams", "n_envs=8")
+    run = succeeded("train", "--algorithms", "A2C", *small, "--out", tmp_path / "one")
     model = tmp_path / "one" / "models" / "shielded-0"
     assert f"agent: {model}" in run.stdout
     summary = json.loads((tmp_path / "one" / "summary.json").read_text())
@@ -201,8 +200,8 @@ def test_synthesize_then_verify(tmp_path):
 
 
 def test_command_does_the_same_in_this_process_and_in_one_of_its_own(tmp_path):
-    own = ncs_process("verify", "nowhere.json", cwd=tmp_path)
-    assert ncs("verify", "nowhere.json", cwd=tmp_path) == (own.returncode, own.stdout, own.stderr)
+    own = ncs_process("fly", cwd=tmp_path)
+    assert ncs("fly", cwd=tmp_path) == (own.returncode, own.stdout, own.stderr)
 
 
 def test_help_of_a_comparison_shows_its_settings_on_two_screens():
@@ -210,7 +209,7 @@ def test_help_of_a_comparison_shows_its_settings_on_two_screens():
     assert run.returncode == 0
     for flag in ("--env", "--channel", "--hyperparams", "--ray-address"):
         assert flag in run.stdout
-    assert len(run.stdout.splitlines()) <= 100
+    assert len(run.stdout.splitlines()) <= 96
 
 
 def test_infeasible_problem_is_one_sentence(tmp_path):

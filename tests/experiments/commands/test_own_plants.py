@@ -84,12 +84,13 @@ def test_certificate_for_a_registered_plant_is_made_and_verified(folder):
     assert_one_sentence(ncs("verify", "certificate.json", "--env", "ncs_gym/TruckTrailer-v0", cwd=folder), "verify")
 
 
-def test_own_plant_is_attacked_on_its_channel_and_without_any_packet(folder):
+def test_own_plant_is_attacked_on_its_channel_and_without_any_packet(folder, monkeypatch):
+    monkeypatch.setattr("experiments.commands.attack.EPISODE_STEPS", 20)
     succeeded("attack", *ENV, "--steps", 1, "--out", "c.json", cwd=folder)
     document = json.loads((folder / "c.json").read_text())
     assert list(document) == ["Plants/Truck-v0, own", "Plants/Truck-v0, blackout"]
     for counts in document.values():
-        assert counts["steps"] == 8 * 200
+        assert counts["steps"] == 8 * 20
         assert counts["outside S"] == counts["no claim"] == 0
         assert counts["overridden"] > 0
     assert_one_sentence(ncs("attack", "--env", "own_plants:Plants/Other-v0", cwd=folder), "Plants/Other-v0")

@@ -39,17 +39,17 @@ def settings(**changes):
 
 def test_command_writes_a_gif_of_both_arms_below_two_megabytes(tmp_path, certificate_file):
     file = tmp_path / "both.gif"
-    run = succeeded("render", "--out", file, "--side-by-side", "--steps", 30, "--certificate", certificate_file)
+    run = succeeded("render", "--out", file, "--side-by-side", "--steps", 15, "--certificate", certificate_file)
     assert file.stat().st_size < 2e6
     with Image.open(file) as image:
-        assert (image.n_frames, image.height) == (31, theme.HEIGHT)
+        assert (image.n_frames, image.height) == (16, theme.HEIGHT)
         assert image.width > 2 * theme.WIDTH
         assert image.info["duration"] == 100
         assert image.info["loop"] == 0
     unshielded, shielded, saved = run.stdout.splitlines()
-    assert unshielded.startswith("no shield: 30 steps, ")
+    assert unshielded.startswith("no shield: 15 steps, ")
     assert " 0 with a violation" not in unshielded
-    assert shielded.startswith("project: 30 steps, 0 with a violation, shield acted ")
+    assert shielded.startswith("project: 15 steps, 0 with a violation, shield acted ")
     assert str(file) in saved
 
 

@@ -11,7 +11,6 @@ from experiments.commands.compare import CompareSettings
 from experiments.commands.paper import PaperSettings
 from experiments.commands.sweep import SweepSettings
 from experiments.commands.train import TrainSettings
-from experiments.errors import OtherResultsError
 from experiments.runs.output_folder import claim_folder
 from experiments.runs.provenance import registration_of
 from ncs_gym import Channel, Regulation, register_plant, truck_trailer
@@ -40,7 +39,7 @@ def finished(command, settings, file="summary.json"):
 def test_folder_with_results_of_other_settings_is_refused(command, kind, change, words, file, tmp_path):
     settings = finished(command, kind(out=tmp_path / "out"), file)
     before = (tmp_path / "out" / "settings.json").read_bytes()
-    with pytest.raises(OtherResultsError, match=f"of other settings.*{words}.*: give another --out, or --force"):
+    with pytest.raises(ValueError, match=f"of other settings.*{words}.*: give another --out, or --force"):
         claim_folder(command, replace(settings, **change))
     assert (tmp_path / "out" / "settings.json").read_bytes() == before
     assert (tmp_path / "out" / file).exists()
@@ -92,7 +91,7 @@ def test_what_an_environment_is_registered_with_is_known(changed):
 
 def test_results_of_another_command_are_refused(tmp_path):
     finished("compare", CompareSettings(out=tmp_path))
-    with pytest.raises(OtherResultsError, match="holds results of ncs compare: give another --out"):
+    with pytest.raises(ValueError, match="holds results of ncs compare: give another --out"):
         claim_folder("train", TrainSettings(out=tmp_path))
 
 
@@ -105,7 +104,7 @@ def test_settings_of_something_else_are_refused(content, has_results, tmp_path):
         (tmp_path / "settings.json").write_bytes(content)
     if content is not None or has_results:
         words = "results without their settings" if has_results else "another settings"
-        with pytest.raises(OtherResultsError, match=rf"holds {words}\.json: give another --out, or --force"):
+        with pytest.raises(ValueError, match=rf"holds {words}\.json: give another --out, or --force"):
             claim_folder("compare", CompareSettings(out=tmp_path))
         assert content is None or (tmp_path / "settings.json").read_bytes() == content
     claim_folder("compare", CompareSettings(out=tmp_path, force=True))

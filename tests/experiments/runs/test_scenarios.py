@@ -10,7 +10,7 @@ from agents.loop import LoopConfig
 from experiments.analysis.episodes import arm_summary
 from experiments.backends.execution import load, save
 from experiments.commands.compare import CompareSettings
-from experiments.report.text_tables import summary_text
+from experiments.report import summary_text
 from experiments.runs.arms import run_of_arm
 from experiments.runs.loops import other_scenarios, scenario_named, under, worse_channel
 from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, GilbertElliott

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from experiments.analysis.stalls import broken_contracts, count_interval, stalls
+from experiments.commands.channel import broken_contracts, count_interval, stalls
 from ncs_gym import Channel, PacketLog, TraceChannel, contract_of
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 

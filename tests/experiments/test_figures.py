@@ -7,9 +7,8 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 
 from agents.results import TrainingPoint
-from experiments.plots import comparison_figures as comparison_module
-from experiments.plots.comparison_figures import RATE_WINDOW, comparison_figures
-from experiments.plots.figure_style import arm_styles, thousands
+from experiments import figures
+from experiments.figures import RATE_WINDOW, arm_styles, comparison_figures, thousands
 from tests.experiments.results import ALL_ARMS, history, run, summary_of
 
 
@@ -18,11 +17,11 @@ def arms(*names, runs=2, **change):
 
 
 def scatter_figure(summary):
-    return comparison_module.scatter_figure(summary, arm_styles(summary))
+    return figures.scatter_figure(summary, arm_styles(summary))
 
 
 def training_figure(shown):
-    return comparison_module.training_figure(shown, arm_styles(shown))
+    return figures.training_figure(shown, arm_styles(shown))
 
 
 def lines(axis):

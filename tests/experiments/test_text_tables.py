@@ -8,8 +8,7 @@ from functools import cache
 import pytest
 
 from experiments.commands.compare import findings_of
-from experiments.report.html import comparison_report
-from experiments.report.text_tables import summary_text, sweep_table
+from experiments.report import comparison_report, summary_text, sweep_table
 from shields import Report
 from shields.verification.condition import flag
 from tests.experiments.results import run, summary_of

@@ -1,5 +1,6 @@
-"""Which hyperparameters a command trains with: those given, those tuned, the defaults."""
+"""Settings of commands that train: where runs are executed, NAME=VALUE, and hyperparameters given, tuned or default."""
 
+import sys
 from dataclasses import replace
 
 import pytest
@@ -11,7 +12,9 @@ from experiments.commands.compare import CompareSettings
 from experiments.commands.sweep import SweepSettings
 from experiments.commands.train import TrainSettings
 from experiments.runs.loops import loop_config
-from experiments.runs.training_run import require_trainable
+from experiments.runs.training_run import TrainingRun, require_trainable
+from experiments.settings import BackendSettings, lasting_settings
+from tests.command import assert_one_sentence, ncs
 
 CART_POLE = "ncs_gym/CartPole-v0"
 
@@ -53,3 +56,46 @@ def test_what_cannot_be_trained_with_is_refused_before_anything_is_computed(algo
     for change, words in (({"gamma": 2.0}, "gamma must be in"), ({"discount": 0.8}, "unknown hyperparameter")):
         with pytest.raises(ValueError, match=words):
             require_trainable(TrainSettings(algorithms=(algo,), hyperparams=change), loop)
+
+
+@pytest.mark.parametrize("command", ["compare", "sweep"])
+def test_ray_missing_is_one_sentence_that_says_what_to_install(command, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "ray", None)  # as if it were not installed
+    run = ncs(command, "--engine", "ray", "--out", tmp_path / "out")
+    assert_one_sentence(run, "this command needs ray: ", "pip install -e '.[ray]'")
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_of_every_engine_have_the_same_key_and_provenance():
+    # A unit does not know its engine, and a summary leaves it out: a sweep begun with one can be finished with another.
+    names = set(BackendSettings.__dataclass_fields__)
+    assert names
+    assert not names & set(TrainingRun.__dataclass_fields__)
+    assert not names & lasting_settings(CompareSettings()).keys()
+
+
+def channel_of(*arguments):
+    return parse(["compare", *arguments]).channel
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0.5", 0.5),
+        ("null", None),
+        ('{"pi": [64]}', {"pi": [64]}),
+        ("lin_0.1", "lin_0.1"),
+        ("nn.ReLU", "nn.ReLU"),
+    ],
+)
+def test_value_is_a_json_value_or_a_word(text, value):
+    given = channel_of("--channel", f"loss={text}")
+    assert given == {"loss": value}
+    assert type(given["loss"]) is type(value)
+
+
+@pytest.mark.parametrize("text", ["dict(a=1)", "[64", "", "a b"])
+def test_what_is_neither_names_the_form(text, capsys):
+    with pytest.raises(SystemExit):
+        channel_of("--channel", f"loss={text}")
+    assert "expected loss=VALUE with a word or a JSON value" in " ".join(capsys.readouterr().err.split())

@@ -1,9 +1,10 @@
 import base64
 import json
 import re
+from functools import cache
 from html.parser import HTMLParser
 
-from experiments.report.html import comparison_report
+from experiments.report import comparison_report
 from shields import Report
 from shields.verification.condition import flag
 from tests.experiments.results import ALL_ARMS, run, summary_of
@@ -50,13 +51,17 @@ def comparison(*names, runs=3, figures=None, findings=(), change=None, **setting
     return comparison_report(summary_of(results, **settings), VERIFIED, figures or {}, list(findings))
 
 
+@cache
+def page_of_all_arms():
+    return comparison(*ALL_ARMS, runs=2, figures={"a": ("A. B.", PNG)})
+
+
 def safety(page):
     return {row[0]: row[1:] for row in Reader(page).tables["Violations and interventions of each arm"]}
 
 
 def test_page_is_well_formed_and_needs_nothing_from_elsewhere():
-    page = comparison(*ALL_ARMS, figures={"a": ("A. B.", PNG)})
-    reader = Reader(page)
+    reader = Reader(page := page_of_all_arms())
     assert reader.open == []
     assert not re.search(r"https?:|//[a-z]|@import|url\(", page)
     assert {tag for tag, _ in reader.tags} & {"script", "link", "iframe", "object", "base"} == set()
@@ -117,7 +122,7 @@ def test_figures_are_embedded_with_their_captions():
 
 
 def test_every_arm_is_in_every_table_and_explained():
-    reader = Reader(comparison(*ALL_ARMS))
+    reader = Reader(page_of_all_arms())
     for name in ("Violations and interventions of each arm", "Return of each arm"):
         assert [row[0] for row in reader.tables[name][1:]] == ALL_ARMS
     assert [row[0] for row in reader.tables["Paired differences"][1:]] == ALL_ARMS[1:]

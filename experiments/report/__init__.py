@@ -1,1 +1,0 @@
-"""The results as a reader sees them: tables on a terminal, and pages with their templates."""
