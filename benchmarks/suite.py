@@ -19,11 +19,11 @@ from scipy.stats import sem, t
 
 from agents.agent_file import AGENT_FILES
 from agents.evaluation import Policy, evaluate
-from agents.hyperparams import with_changes
+from agents.hyperparams import DEFAULTS, with_changes
 from agents.loop import LoopConfig
 from benchmarks.commands import run, some_of
 from benchmarks.suite_figures import suite_figures
-from benchmarks.suite_observations import Remembered, Shown
+from benchmarks.suite_observations import OneErrorSet, Remembered, Shown
 from experiments.analysis.episodes import episodes_table, training_table
 from experiments.analysis.statistics import CONFIDENCE, clopper_pearson
 from experiments.backends.execution import results_of
@@ -61,6 +61,7 @@ class Entry:
         attacked: Whether they are trained under the attack.
         observed: What agents see besides: "disturbance", the estimated one, or "memory"; empty for nothing.
         safe_set: What the shield keeps, "ellipsoid"; empty for the polytope of the others.
+        one_error_set: Whether the shield takes every error for one that holds those of all ages.
         everywhere: Whether the row is that of all tasks, not only of those in which the network decides.
         seeds: Runs of a block; None for as many as asked for.
     """
@@ -70,6 +71,7 @@ class Entry:
     attacked: bool = False
     observed: str = ""
     safe_set: str = ""
+    one_error_set: bool = False
     everywhere: bool = False
     seeds: int | None = None
 
@@ -100,10 +102,11 @@ SECONDARY = {
 REGULATED = {
     "lqr": Entry("lqr", everywhere=True),
     "lqr:observer": Entry("lqr:observer", everywhere=True),
-    **{name: Entry(name) for name in ("mpc:20", "mpc:40", "mpc:observer")},
+    **{name: Entry(name) for name in ("mpc:20", "mpc:40", "mpc:observer", "mpc:observer+shielded")},
     **{f"lqr+{name}": Entry(f"lqr+{name}") for name in ("trusting:20", "psf:20", "psf:tube")},
     "lqr+shielded": Entry("lqr+shielded", everywhere=True),
     "lqr:observer+ellipsoid": Entry("lqr:observer+shielded", safe_set="ellipsoid"),
+    "lqr:observer+one set": Entry("lqr:observer+shielded", one_error_set=True),
     "lqr:observer+lookahead": Entry("lqr:observer+lookahead"),
 }
 # Policies that are the same in all runs need fewer.
@@ -251,6 +254,7 @@ def _settings(task: str, block: int, seeds: int, steps: int, episodes: int, jobs
         steps=steps,
         episodes=episodes,
         scenarios=SCENARIOS,
+        hyperparams=DEFAULTS["PPO"],  # which what was tuned for an arm changes
         tuned_arms=True,
         jobs=jobs,
         out=out / task / str(block),
@@ -264,12 +268,15 @@ def _block(settings: CompareSettings, names: Sequence[str]) -> dict[str, Any]:
 
     def runs_of(entry: Entry, arm: str, point: str = "") -> list[TrainingRun]:
         own = certificate_of(loop, None, entry.safe_set) if entry.safe_set else certificate
-        point = point or ("attacked" if entry.attacked else entry.observed or entry.safe_set)
+        changed = ("attacked" if entry.attacked else "") or ("one set" if entry.one_error_set else "")
+        point = point or changed or entry.observed or entry.safe_set
         runs = []
         for index in range(min(settings.seeds, entry.seeds or settings.seeds)):
             each = run_of_arm(settings, loop, own, arm, index, point)
             if entry.attacked:
                 each = replace(each, training_loop=under(ATTACKED, each.training_loop))
+            if entry.one_error_set:
+                each = replace(each, loop=replace(each.loop, shield=None, filter=OneErrorSet(own)))
             runs.append(_seeing(entry, each, settings) if entry.observed else each)
         return runs
 

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents.hyperparams import DEFAULTS
 from benchmarks import suite
 from benchmarks.suite import (
     ATTACKED,
@@ -130,6 +131,11 @@ def test_every_impairment_keeps_the_contract_and_has_what_is_on(task):
             channel.send_period > 1,
             channel.quantization_step > 0.0,
         ) == tuple(name in on for name in SWITCHES)
+
+
+def test_agents_have_what_was_tuned_for_as_many_steps_as_they_are_trained(tmp_path):
+    settings = suite._settings("CartPole-v0", 0, 1, suite.STEPS, 1, 1, tmp_path)
+    assert settings.all_hyperparams == DEFAULTS["PPO"]  # not those for ten times as many
 
 
 @pytest.mark.slow
