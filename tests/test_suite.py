@@ -106,11 +106,8 @@ def test_tables_have_every_row_and_no_negative_zero(found):
 def test_differences_are_taken_run_by_run(found):
     found["tasks"]["Convoy-v0"]["0"]["lqr:observer+shielded"]["scenarios"][AS_TRAINED]["return"] = [151.0, 152.0]
     lines = suite.differences_table(found).splitlines()
-    fewer = lines[lines.index("lqr:observer+shielded - shielded: return, as trained") + 1]
-    assert "+2.0" in fewer
-    first = lines[lines.index("unshielded - shielded: violating, attacked [points]") + 1]
-    assert re.split(r"\s{2,}", first.strip())[0] == "Convoy-v0"
-    assert "+50.0 +50.0" in first
+    fewer = lines[lines.index("lqr:observer+shielded - shielded") + 1]
+    assert re.split(r"\s{2,}", fewer.strip())[:2] == ["Convoy-v0", "+2.0 +0.0"]
 
 
 def test_figures_are_drawn_from_the_numbers(found):
