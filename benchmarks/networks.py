@@ -407,7 +407,7 @@ def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> Captioned
     """Returns the figure of what was measured, by environment, filter and network."""
     drawn = CaptionedFigure((8.0, 0.8 + 0.24 * sum(map(len, found.values())) + 0.5 * len(found)))
     heights = [len(filters) for filters in found.values()]
-    axes = drawn.subplots(len(found), 2, squeeze=False, width_ratios=(3, 2), height_ratios=heights)
+    axes = drawn.subplots(len(found), 2, squeeze=False, sharex="col", width_ratios=(3, 2), height_ratios=heights)
     handles: dict[str, Artist] = {}
     for (left, claimed), (env, filters) in zip(axes, found.items(), strict=True):
         for axis in (left, claimed):
@@ -418,7 +418,6 @@ def _claims_drawn(found: dict[str, dict[str, dict[str, Measured]]]) -> Captioned
         left.set_xticks([0, 10, 100, 1000, 10000], ["0", "10", "100", "1,000", "10,000"])
         left.xaxis.set_minor_locator(NullLocator())
         left.set_title(env, loc="left")
-        claimed.set_xlim(94.8, 100.2)
         for row, (name, networks) in enumerate(filters.items()):
             for offset, (network, each) in zip((-0.27, -0.09, 0.09, 0.27), networks.items(), strict=True):
                 color, marker = MARKS[network]
