@@ -1,4 +1,4 @@
-"""What agents of the benchmark see besides the estimate: the disturbance that persists, or what happened before."""
+"""What the benchmark changes of what is known: agents see the disturbance or what happened, shields no age."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from gymnasium.vector.utils import batch_space
 from experiments.baselines.observer import DisturbanceObserver
 from experiments.baselines.tuned import tuned_weights
 from ncs_gym.validation import AroundEnvironments
+from shields import Certificate, VectorSafetyShield
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,30 @@ class Remembered:
     def __call__(self, envs: VectorEnv) -> VectorEnv:
         """Returns the environments with the last estimates and actions after their observations."""
         return WithMemory(envs, self.steps)
+
+
+@dataclass(frozen=True)
+class OneErrorSet:
+    """A shield that takes every estimation error for one of any age: what passes is safe for all of them.
+
+    In the rows of a polytope that is the smallest set that holds the error sets of all ages.
+
+    Attributes:
+        certificate: Of a polytope and a contract, which the network keeps.
+    """
+
+    certificate: Certificate
+
+    def __call__(self, envs: VectorEnv) -> VectorSafetyShield:
+        """Returns the environments behind the shield."""
+        shield = VectorSafetyShield(envs, self.certificate, on_unproved="ignore")
+        by_age = shield.filter.errors_of_many(self.certificate.error_shapes)
+        worst = {name: np.max for name in ("half_widths", "own")}
+        one = by_age._make(
+            worst.get(name, np.min)(each, axis=-1, keepdims=True) for name, each in by_age._asdict().items()
+        )
+        vars(shield.filter)["errors_of_many"] = lambda shapes: one.of(np.zeros(len(shapes), np.intp))
+        return shield
 
 
 class WithMore(AroundEnvironments, VectorWrapper, ABC):

@@ -80,6 +80,18 @@ def test_an_hour_without_an_end_says_what_it_rules_out():
     assert (low, high) == pytest.approx((28.58 / 2.0, 54.47 / 2.0), abs=5e-3)
 
 
+@pytest.mark.parametrize("drive", [networks.RURAL, networks.URBAN])
+def test_packets_of_a_drive_wait_and_arrive_in_order_as_in_the_records_it_was_fitted_to(drive):
+    sent = 0.05 * np.arange(round(networks.SPAN / 0.05))
+    records = [(sent, sent + drive.delays(np.random.default_rng(seed), sent)) for seed in range(8)]
+    assert all((np.diff(arrived) > 0.0).all() for _, arrived in records)
+    found = networks.Drive.of(records)
+    assert found.stalls == pytest.approx(drive.stalls, rel=0.1)
+    assert np.log([found.shortest / drive.shortest, found.longest / drive.longest]) == pytest.approx(0.0, abs=0.25)
+    stalled = sum(networks.stalls_of(*each).sum() for each in records) / (8.0 * networks.SPAN)
+    assert stalled == pytest.approx({1352: 0.37, 34: 0.003}[drive.stalls], rel=0.15)
+
+
 def test_the_fixed_part_of_the_long_tests_exists():
     part = re.search(r"^SLOW_PART \?= ((?:.*\\\n)*.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert part

@@ -1,14 +1,16 @@
-"""What agents of the benchmark see besides the estimate."""
+"""What agents of the benchmark see besides the estimate, and a shield that knows no age."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from benchmarks.suite_observations import Remembered, Shown
+from benchmarks.suite_observations import OneErrorSet, Remembered, Shown
 from experiments.baselines.observer import DisturbanceObserver
 from experiments.baselines.tuned import tuned_weights
 from ncs_gym.envs.env import ncs_env
+from shields import certificate_for
+from shields.runtime.safety_filter import SafetyFilter
 
 CASE = "ncs_gym/CSTR-v0"
 STEPS, COUNT = 12, 3
@@ -69,3 +71,18 @@ def test_a_loop_that_begins_again_forgets_and_the_others_do_not_move(observed):
     first = np.append(after[1, :n], 0.0) if isinstance(observed, Remembered) else np.zeros(n)
     assert np.array_equal(after[1, width:], np.tile(first, (len(after[1]) - width) // len(first)).astype(np.float32))
     assert not np.array_equal(after[1, width:], before[1, width:])
+
+
+def test_a_shield_with_one_error_set_lets_pass_what_is_safe_at_every_age():
+    convoy = ncs_env(gym.make("ncs_gym/Convoy-v0"))  # of whose error sets none holds the others
+    certificate = certificate_for(convoy.plant, convoy.certificate_contract)
+    shield = OneErrorSet(certificate)(gym.make_vec("ncs_gym/Convoy-v0", num_envs=2))
+    rng, own = np.random.default_rng(0), SafetyFilter(certificate, convoy.plant)
+    estimates = rng.uniform(-0.8, 0.8, (400, convoy.plant.n)) * convoy.plant.half_widths
+    inputs = rng.uniform(*convoy.plant.input_ends, (400, convoy.plant.m))
+    one = shield.filter.decide_many(estimates, certificate.error_shapes[0], inputs)
+    ages = [own.decide_many(estimates, shape, inputs).intervened for shape in certificate.error_shapes]
+    assert np.array_equal(one.intervened, np.any(ages, axis=0))
+    assert 2 * ages[0].sum() < one.intervened.sum() < 400
+    shield.reset(seed=0)
+    assert shield.step(np.zeros((2, 1), np.float32))[-1]["shield_guaranteed"].all()
