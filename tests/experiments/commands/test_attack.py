@@ -74,7 +74,6 @@ def test_lookahead_may_leave_the_safe_set_and_keeps_the_box():
     assert others == ["0", "0"]
 
 
-@pytest.mark.cases(1)
 @pytest.mark.parametrize(
     ("said", "words"),
     [
