@@ -66,18 +66,9 @@ class InvariantSetProgram:
         return constraints
 
     def solve(
-        self,
-        multipliers: tuple[float, float, float],
-        inputs: np.ndarray,
-        linearize_at: np.ndarray,
+        self, multipliers: tuple[float, float, float], inputs: np.ndarray, linearize_at: np.ndarray
     ) -> CandidateDesign | None:
-        """Returns the design of largest volume for given multipliers; None if there is none.
-
-        Args:
-            multipliers: Multipliers (lx, le, ld) > 0 that sum to 1.
-            inputs: Multipliers mu_i in (0, 1), shape (m,).
-            linearize_at: The shape L0 at which X is linearized, (n, n).
-        """
+        """Returns the design of largest volume for multipliers (lx, le, ld) and mu, (m,), and L0, (n, n); or None."""
         lx, le, ld = multipliers
         self._by_state.value = 1.0 / (lx * (1.0 - self._slack))
         self._D_u.value = self._problem.D_u * ((1.0 + self._slack) / ld)

@@ -14,11 +14,7 @@ LOGARITHM_DIGITS = 9
 
 
 def best_multipliers(
-    problem: DesignProblem,
-    error_shapes: np.ndarray,
-    L: np.ndarray,
-    K: np.ndarray,
-    initial: tuple[float, float, float],
+    problem: DesignProblem, error_shapes: np.ndarray, L: np.ndarray, K: np.ndarray, initial: tuple[float, float, float]
 ) -> tuple[tuple[float, float, float], float]:
     """Returns the multipliers (lx, le, ld) of (I), and the largest eigenvalue of the successors' shape against L.
 
