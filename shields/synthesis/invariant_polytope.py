@@ -46,6 +46,10 @@ _LEAST_POINTS = 4000
 _MOST_STEPS = 3000
 
 
+# Called with a line of text now and then: what is sought, and what is reached.
+Progress = Callable[[str], object]
+
+
 class Feedback(NamedTuple):
     """The fallback u = u_c + K (x_hat - x_c), K of shape (m, n), with shapes of errors, (l, n, n), and D, (n, n)."""
 
@@ -75,7 +79,7 @@ def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces
 
 
 def invariant_polytope(
-    feedback: Feedback, plant: LinearPlant, margin: float, progress: Callable[[str], object] = lambda line: None
+    feedback: Feedback, plant: LinearPlant, margin: float, progress: Progress = lambda line: None
 ) -> Polytope:
     """Returns the largest polytope that a fallback keeps invariant, not yet verified.
 
@@ -111,7 +115,7 @@ def invariant_faces(
     faces: Faces,
     predecessor: Callable[[Faces], Faces],
     kept: int,
-    progress: Callable[[str], object] = lambda line: None,
+    progress: Progress = lambda line: None,
     implied: float = _IMPLIED,
 ) -> Faces:
     """Returns the faces of the largest polytope in another one whose states stay in it.

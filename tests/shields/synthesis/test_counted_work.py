@@ -13,7 +13,7 @@ from experiments.commands.synthesize import SynthesizeSettings
 from experiments.commands.synthesize import synthesize as run_command
 from ncs_gym import ChannelContract
 from shields import Infeasible, verify
-from shields.synthesis import ellipsoid_certificates, invariant_polytope, search
+from shields.synthesis import certification, ellipsoid_certificates, invariant_polytope
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.invariant_set_program import InvariantSetProgram
 from tests.plants import random_plant
@@ -68,7 +68,7 @@ def test_few_gains_whose_polytopes_have_too_many_rows_end_the_search(monkeypatch
 
 
 def test_best_certificate_in_time_is_verified_and_says_that_the_time_was_over(loaded, monkeypatch):
-    monkeypatch.setattr(search.time, "thread_time", Processor(1.0))
+    monkeypatch.setattr(certification.time, "thread_time", Processor(1.0))
     certificate = synthesize(loaded, time_limit=3.0)
     assert verified(certificate, loaded).valid
     told = "the synthesis was stopped at initial design, when the time_limit of 3 s was over: other sets may be"
@@ -77,7 +77,7 @@ def test_best_certificate_in_time_is_verified_and_says_that_the_time_was_over(lo
 
 def test_command_ends_after_a_minute_of_work(loaded, monkeypatch, tmp_path, capsys):
     loaded.save(tmp_path / "plant.json")
-    monkeypatch.setattr(search.time, "thread_time", Processor(20.0))
+    monkeypatch.setattr(certification.time, "thread_time", Processor(20.0))
     run_command(SynthesizeSettings(plant=tmp_path / "plant.json", out=tmp_path / "certificate.json"))
     assert "the time_limit of 60 s was over" in " ".join(capsys.readouterr().out.split())
 
