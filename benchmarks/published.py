@@ -105,24 +105,24 @@ def channel_of(name: str) -> Channel:
 
 
 def shares(names: Names = ()) -> None:
-    """What share of the published box a certificate keeps, and how long its synthesis takes with two verifications.
+    """What share of the published box a certificate keeps, and how long the processor works for it, verified twice.
 
     Where that is not known, "to 90 %" is how far every limited quantity gets at least on the way to its limits.
     The last line says how many of the plants have a certificate.
     """
-    show = table("plant", "n, m", "age", "limits", "share", "at most", "rows", "time [s]", first=18, width=11)
+    show = table("plant", "n, m", "age", "limits", "share", "at most", "rows", "CPU [s]", first=18, width=11)
     found = 0
     for name in names or published():
-        began, plant = time.perf_counter(), plant_of(name)
+        began, plant = time.process_time(), plant_of(name)
         free = plant.n - int(np.linalg.matrix_rank(plant.box))
         limits = f"{free} free" if free else "symmetric" if plant.is_symmetric else "two ends"
         known = f"{plant.n}, {plant.m}", published()[name]["max_age"], limits
         try:
             certificate = certified(name, plant)
         except Infeasible as infeasible:
-            show(name, *known, f"none ({infeasible.binding})", "", "", f"{time.perf_counter() - began:.1f}")
+            show(name, *known, f"none ({infeasible.binding})", "", "", f"{time.process_time() - began:.1f}")
             continue
-        took, found = f"{time.perf_counter() - began:.1f}", found + 1
+        took, found = f"{time.process_time() - began:.1f}", found + 1
         share, at_most = certificate.provenance.get("polytope_share_of_box"), largest_share(plant)
         if share is None or at_most is None:
             reached = [end for each in reach_of(certificate, plant) for end in (each.low, each.high) if end is not None]

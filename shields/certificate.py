@@ -274,39 +274,27 @@ class Certificate(ReadOnlyArrays):
             inside = "inside it the ellipsoid" if self.keeps_ellipsoid else "inside it, not invariant, the ellipsoid"
             kind = "|g x| <= 1" if self.polytope.is_symmetric else "low <= g x <= high"
             safe_set = f"the polytope {kind} of {len(self.polytope.rows)} rows g; {inside} "
-        widths = ", ".join(f"{width:.4g}" for width in self._widths)
-        ellipsoid = "x'Mx <= 1, that reaches |x_i|"
-        if self._rests_elsewhere:
+        sizes = np.sqrt(np.diag(self.L))
+        widths = ", ".join(f"{width:.4g}" for width in sizes)
+        ellipsoid, fallback = "x'Mx <= 1, that reaches |x_i|", "u = K x_hat"
+        if self.resting_state.any() or self.resting_input.any():
             ellipsoid = "(x - x_c)'M(x - x_c) <= 1, that reaches |x_i - x_c,i|"
+            x_c, u_c = (
+                ", ".join(f"{0.0 if abs(each) <= _DUST * size else each:.4g}" for each, size in zip(*of, strict=True))
+                for of in ((self.resting_state, sizes), (self.resting_input, np.abs(self.K) @ sizes))
+            )
+            fallback = f"u = u_c + K (x_hat - x_c), with x_c = ({x_c}) and u_c = ({u_c}) from the operating point"
         rows = [
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
             ("safe set", f"{safe_set}{ellipsoid} <= {widths}"),
             ("claim", f"in the safe box {claim}"),
             ("size", size_of(self)),
             ("polytope", missing_polytope_of(recorded) if self.polytope is None else ""),
-            ("fallback", self._fallback_text()),
+            ("fallback", fallback),
             ("contract", contract_text(self.contract)),
             *provenance_rows(recorded),
         ]
         return table("Certificate of a robust control invariant set (shields.verify checks it)", rows)
-
-    @property
-    def _rests_elsewhere(self) -> bool:
-        return bool(self.resting_state.any() or self.resting_input.any())
-
-    @property
-    def _widths(self) -> np.ndarray:
-        return np.sqrt(np.diag(self.L))
-
-    def _fallback_text(self) -> str:
-        if not self._rests_elsewhere:
-            return "u = K x_hat"
-        points = (self.resting_state, self._widths), (self.resting_input, np.abs(self.K) @ self._widths)
-        x_c, u_c = (
-            ", ".join(f"{0.0 if abs(each) <= _DUST * size else each:.4g}" for each, size in zip(*point, strict=True))
-            for point in points
-        )
-        return f"u = u_c + K (x_hat - x_c), with x_c = ({x_c}) and u_c = ({u_c}) from the operating point"
 
     def without_polytope(self) -> Certificate:
         """Returns the certificate of the ellipsoid alone; raises CertificateError if it does not keep the ellipsoid."""

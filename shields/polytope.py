@@ -53,21 +53,18 @@ class Polytope(ReadOnlyArrays):
             rows = as_matrix(self.rows, (None, None), "the rows of the polytope")
             multipliers = as_matrix(self.multipliers, (None, len(rows)), "the multipliers of the polytope")
             _require_size(len(rows), len(multipliers))
-            ends = _ends_of(self.low, self.high, len(rows))
+            low, high = _ends_of(self.low, self.high, len(rows))
             n = rows.shape[1]
             center = np.zeros(n) if self.center is None else as_vector(self.center, n, "the center of the polytope")
             lower = multipliers
             if self.lower_multipliers is not None:
                 lower = as_matrix(self.lower_multipliers, multipliers.shape, "the lower multipliers of the polytope")
             reached = rows @ center
-            if not ((ends[0] < reached) & (reached < ends[1])).all():
+            if not ((low < reached) & (reached < high)).all():
                 raise ValueError("the center of the polytope is not inside")
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
-        values = {"rows": rows, "multipliers": multipliers, "low": ends[0], "high": ends[1], "center": center}
-        for name, value in (values | {"lower_multipliers": lower}).items():
-            object.__setattr__(self, name, value)
-        self._make_arrays_read_only()
+        self._set(rows=rows, multipliers=multipliers, low=low, high=high, center=center, lower_multipliers=lower)
 
     @cached_property
     def is_symmetric(self) -> bool:
@@ -80,14 +77,8 @@ class Polytope(ReadOnlyArrays):
         """All faces: P = {x : F (x - c) <= 1}, shape (q, n); those of high ends, and then those of low ones."""
         reached = self.rows @ self.center
         above, below = np.isfinite(self.high), np.isfinite(self.low)
-        return read_only(
-            np.concatenate(
-                [
-                    self.rows[above] / (self.high - reached)[above, None],
-                    self.rows[below] / (self.low - reached)[below, None],
-                ]
-            )
-        )
+        ends = np.concatenate([(self.high - reached)[above], (self.low - reached)[below]])
+        return read_only(np.concatenate([self.rows[above], self.rows[below]]) / ends[:, None])
 
     @cached_property
     def widths(self) -> np.ndarray:

@@ -39,9 +39,6 @@ class PaperCertificate(ReadOnlyArrays):
         epsilon_up: Bound on the squared uplink error of Theorem 2.
         fingerprint: Fingerprint of the plant that it belongs to.
         provenance: How it was made; it proves nothing.
-
-    Raises:
-        CertificateError: If a field is of the wrong kind.
     """
 
     L: np.ndarray
@@ -56,13 +53,10 @@ class PaperCertificate(ReadOnlyArrays):
     def __post_init__(self) -> None:
         try:
             n = len(as_matrix(self.L, (None, None), "L"))
-            object.__setattr__(self, "L", as_matrix(self.L, (n, n), "L"))
-            object.__setattr__(self, "K", as_matrix(self.K, (None, n), "K"))
-            for name in ("kappa", "rho", "epsilon", "epsilon_up"):
-                object.__setattr__(self, name, as_number(getattr(self, name), name))
+            numbers = {name: as_number(getattr(self, name), name) for name in ("kappa", "rho", "epsilon", "epsilon_up")}
+            self._set(L=as_matrix(self.L, (n, n), "L"), K=as_matrix(self.K, (None, n), "K"), **numbers)
         except (TypeError, ValueError) as error:
             raise CertificateError(f"not a certificate: {error}") from error
-        self._make_arrays_read_only()
 
     def __str__(self) -> str:
         m, n = self.K.shape

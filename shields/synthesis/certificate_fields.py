@@ -16,7 +16,7 @@ from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import reach_in
 from shields.polytope import Polytope
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
-from shields.synthesis.multipliers import with_best_multipliers
+from shields.synthesis.invariant_set_program import with_best_multipliers
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 
 # Significant digits of the numbers of a certificate: what differs between processors beyond them is cut off. Sizes

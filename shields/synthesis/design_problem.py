@@ -28,24 +28,14 @@ _SHARE_OF_DIRECTION = 0.1
 
 
 class Rest(NamedTuple):
-    """The point at which the fallback input rests: x_c = A x_c + B u_c.
-
-    Attributes:
-        state: x_c, shape (n,).
-        input: u_c, shape (m,).
-    """
+    """The point x_c, (n,), and u_c, (m,), at which the fallback input rests: x_c = A x_c + B u_c."""
 
     state: np.ndarray
     input: np.ndarray
 
 
 class SymmetricLimits(NamedTuple):
-    """Limits |c_j z| <= 1 and |v_i| <= u_max_i of states and inputs from a resting point.
-
-    Attributes:
-        box_rows: c, shape (k, n), of full column rank.
-        u_max: Shape (m,).
-    """
+    """Limits |c_j z| <= 1, c of shape (k, n) and full column rank, and |v_i| <= u_max_i, (m,), from a resting point."""
 
     box_rows: np.ndarray
     u_max: np.ndarray
@@ -102,13 +92,9 @@ class DesignProblem:
 
 @dataclass(frozen=True, eq=False)
 class CandidateDesign:
-    """A candidate for an invariant set in scaled coordinates, not yet verified.
+    """An ellipsoid E(L), (n, n), and a gain K, (m, n), in scaled coordinates, not yet verified.
 
-    Attributes:
-        L: Shape of the set, (n, n).
-        K: Gain, shape (m, n).
-        multipliers: Multipliers (lx, le, ld) of (I).
-        inputs: Multipliers mu_i of (U), shape (m,).
+    Its multipliers are (lx, le, ld) of (I), and mu of (U), shape (m,).
     """
 
     L: np.ndarray

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,11 +20,18 @@ from shields.errors import Infeasible
 from shields.synthesis.certificate_fields import certificate_of
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem, SymmetricLimits, design_problem
 from shields.synthesis.invariant_polytope import feedback_of, limits_within_step
-from shields.synthesis.invariant_set_program import InvariantSetProgram, max_slack_gain
-from shields.synthesis.multipliers import best_input_multipliers, best_multipliers, with_best_multipliers
-from shields.synthesis.search import Search
+from shields.synthesis.invariant_set_program import (
+    InvariantSetProgram,
+    best_input_multipliers,
+    best_multipliers,
+    max_slack_gain,
+    with_best_multipliers,
+)
 from shields.synthesis.tolerance import SUFFICIENT_MARGIN, Tolerated, invariant_ellipsoid
 from shields.verification import Report, verify
+
+if TYPE_CHECKING:
+    from shields.synthesis.certification import Search
 
 # Relative tightening of the semidefinite programs, so that the result verifies exactly.
 _SLACK = 1e-6

@@ -22,12 +22,7 @@ _NO_END = (highspy.HighsModelStatus.kUnbounded, highspy.HighsModelStatus.kUnboun
 
 
 class Faces(NamedTuple):
-    """Rows with two ends, low <= g z <= high, around z = 0; an end that is open is infinite.
-
-    Attributes:
-        rows: Shape (r, n).
-        low, high: Shape (r,).
-    """
+    """Rows with two ends, low <= g z <= high, shape (r, n), around z = 0; an end that is open is infinite."""
 
     rows: np.ndarray
     low: np.ndarray

@@ -46,15 +46,12 @@ _LEAST_POINTS = 4000
 _MOST_STEPS = 3000
 
 
-class Feedback(NamedTuple):
-    """The fallback u = u_c + K (x_hat - x_c) with what disturbs it.
+# Called with a line of text now and then: what is sought, and what is reached.
+Progress = Callable[[str], object]
 
-    Attributes:
-        K: The gain, shape (m, n).
-        errors: Shapes of the error sets, (l, n, n).
-        D: Shape of the disturbance set, (n, n).
-        rest: x_c and u_c.
-    """
+
+class Feedback(NamedTuple):
+    """The fallback u = u_c + K (x_hat - x_c), K of shape (m, n), with shapes of errors, (l, n, n), and D, (n, n)."""
 
     K: np.ndarray
     errors: np.ndarray
@@ -82,7 +79,7 @@ def in_half_ranges(rows: np.ndarray, low: np.ndarray, high: np.ndarray) -> Faces
 
 
 def invariant_polytope(
-    feedback: Feedback, plant: LinearPlant, margin: float, progress: Callable[[str], object] = lambda line: None
+    feedback: Feedback, plant: LinearPlant, margin: float, progress: Progress = lambda line: None
 ) -> Polytope:
     """Returns the largest polytope that a fallback keeps invariant, not yet verified.
 
@@ -118,7 +115,7 @@ def invariant_faces(
     faces: Faces,
     predecessor: Callable[[Faces], Faces],
     kept: int,
-    progress: Callable[[str], object] = lambda line: None,
+    progress: Progress = lambda line: None,
     implied: float = _IMPLIED,
 ) -> Faces:
     """Returns the faces of the largest polytope in another one whose states stay in it.
@@ -148,13 +145,11 @@ def invariant_faces(
             continue
         if len(within.faces.rows) > most:  # what later ones imply leads nowhere else, either
             faces, following = _without_implied(within.faces, kept, implied, following)
-            if len(faces.rows) > MOST_ROWS:
-                raise _too_many(
-                    f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance"
-                )
+            _require_few(faces)
             within, most = Extremes(faces), max(MOST_ROWS, int(_GROWN * len(faces.rows)))
         if followed >= MOST_FOLLOWED:
-            raise _too_many(f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps")
+            reason = f"its search follows more than {MOST_FOLLOWED} rows, fewer with longer steps"
+            raise Infeasible(reason, "R", 0.0)
         if following % 50 == 0:
             progress(f"polytope: {len(within.faces.rows)} rows")
         row = predecessor(within.faces.some([following]))
@@ -165,8 +160,7 @@ def invariant_faces(
     faces = own.followed_by(within.faces.some(slice(kept, None)))
     progress(f"polytope: which of {len(faces.rows)} rows count")
     faces = _bounding_every_state(_without_implied(faces, kept, implied)[0], kept)
-    if len(faces.rows) > MOST_ROWS:
-        raise _too_many(f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance")
+    _require_few(faces)
     return faces
 
 
@@ -320,8 +314,10 @@ def _none(reason: str) -> Infeasible:
     return Infeasible(reason, "P", 0.0)
 
 
-def _too_many(reason: str) -> Infeasible:
-    return Infeasible(reason, "R", 0.0)
+def _require_few(faces: Faces) -> None:
+    if len(faces.rows) > MOST_ROWS:
+        reason = f"it would need more than {MOST_ROWS} rows, fewer with longer steps or less disturbance"
+        raise Infeasible(reason, "R", 0.0)
 
 
 def _extents(faces: Faces) -> np.ndarray:

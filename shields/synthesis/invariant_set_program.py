@@ -1,13 +1,22 @@
-"""The linear matrix inequalities of the certified method for fixed multipliers (docs/shield_proof.md)."""
+"""The certified method's linear matrix inequalities for fixed multipliers, and the multipliers that prove a set best.
+
+The latter minimize convex functions of one or two numbers (docs/shield_proof.md).
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cvxpy as cp
 import numpy as np
+from scipy.optimize import minimize
 
 from shields.synthesis.design_problem import CandidateDesign, DesignProblem
 from shields.synthesis.semidefinite_programs import is_solved, value_of
 from shields.verification import ACTION_ROUNDING
+
+# Digits of the logarithms of ratios of multipliers: a search ends at the same ones on every processor.
+LOGARITHM_DIGITS = 9
 
 
 class InvariantSetProgram:
@@ -66,18 +75,9 @@ class InvariantSetProgram:
         return constraints
 
     def solve(
-        self,
-        multipliers: tuple[float, float, float],
-        inputs: np.ndarray,
-        linearize_at: np.ndarray,
+        self, multipliers: tuple[float, float, float], inputs: np.ndarray, linearize_at: np.ndarray
     ) -> CandidateDesign | None:
-        """Returns the design of largest volume for given multipliers; None if there is none.
-
-        Args:
-            multipliers: Multipliers (lx, le, ld) > 0 that sum to 1.
-            inputs: Multipliers mu_i in (0, 1), shape (m,).
-            linearize_at: The shape L0 at which X is linearized, (n, n).
-        """
+        """Returns the design of largest volume for multipliers (lx, le, ld) and mu, (m,), and L0, (n, n); or None."""
         lx, le, ld = multipliers
         self._by_state.value = 1.0 / (lx * (1.0 - self._slack))
         self._D_u.value = self._problem.D_u * ((1.0 + self._slack) / ld)
@@ -121,3 +121,52 @@ def max_slack_gain(problem: DesignProblem, design: CandidateDesign) -> np.ndarra
             blocks = [[limit, state, error], [state.T, mu * L, zero], [error.T, zero, (1.0 - mu) * identity]]
             constraints.append(cp.bmat(blocks) >> 0)
     return value_of(K) if is_solved(cp.Problem(cp.Minimize(t), constraints)) else design.K
+
+
+def best_multipliers(
+    problem: DesignProblem, error_shapes: np.ndarray, L: np.ndarray, K: np.ndarray, initial: tuple[float, float, float]
+) -> tuple[tuple[float, float, float], float]:
+    """Returns the multipliers (lx, le, ld) of (I), and the largest eigenvalue of the successors' shape against L.
+
+    The successors' shape is matrix-convex in the multipliers, so its largest generalized eigenvalue, over all error
+    sets, (k, n, n), is a convex function of two numbers. (I) holds if it is at most 1. All is scaled.
+    """
+    inverse_factor = np.linalg.inv(np.linalg.cholesky(L))
+    # Shapes of what state, errors and disturbance each add to the successors, in coordinates in which E(L) is a ball.
+    closed_loop, from_errors = inverse_factor @ (problem.A + problem.B @ K), inverse_factor @ problem.B @ K
+    state_shape = closed_loop @ L @ closed_loop.T
+    moved_error_shapes = from_errors @ error_shapes @ from_errors.T
+    disturbance_shape = inverse_factor @ problem.D_u @ inverse_factor.T
+
+    def multipliers_of(logits: np.ndarray) -> np.ndarray:
+        weights = np.exp(np.clip(np.append(logits, 0.0), -30.0, 30.0))
+        return weights / weights.sum()
+
+    def largest_eigenvalue(logits: np.ndarray) -> float:
+        lx, le, ld = multipliers_of(logits)
+        successors = state_shape / lx + moved_error_shapes / le + disturbance_shape / ld
+        return float(np.linalg.eigvalsh(successors)[:, -1].max())
+
+    logits = np.log(np.array(initial[:2]) / initial[2])
+    # What is compared differs by much more than rounding: all processors go the same way.
+    options = {"xatol": 1e-5, "fatol": 1e-10, "maxiter": 400}
+    minimum = minimize(largest_eigenvalue, logits, method="Nelder-Mead", options=options)
+    lx, le, ld = multipliers_of(np.round(minimum.x, LOGARITHM_DIGITS))
+    return (float(lx), float(le), float(ld)), float(minimum.fun)
+
+
+def best_input_multipliers(error_shapes: np.ndarray, L: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Returns the multipliers mu_i of (U), shape (m,): the fraction of the largest input that is due to the state.
+
+    mu_i = a / (a + b), a = sqrt(K_i L K_i') due to the state, b = max sqrt(K_i Sigma K_i') due to the error, scaled.
+    """
+    by_state = np.sqrt(np.maximum(((K @ L) * K).sum(axis=1), 0.0))
+    by_error = np.sqrt(np.maximum(((K @ error_shapes) * K).sum(axis=-1), 0.0)).max(axis=0)
+    return np.clip(np.round(by_state / np.maximum(by_state + by_error, 1e-300), 6), 1e-6, 1.0 - 1e-6)
+
+
+def with_best_multipliers(problem: DesignProblem, design: CandidateDesign, error_shapes: np.ndarray) -> CandidateDesign:
+    """Returns a design with the multipliers that suit the error sets of the given shapes (k, n, n) best."""
+    multipliers, _ = best_multipliers(problem, error_shapes, design.L, design.K, design.multipliers)
+    inputs = best_input_multipliers(error_shapes, design.L, design.K)
+    return replace(design, multipliers=multipliers, inputs=inputs)

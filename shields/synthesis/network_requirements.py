@@ -6,7 +6,7 @@ of its values (the quantization step).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +17,8 @@ from ncs_gym.network.contract import MAX_AGE
 from ncs_gym.validation import as_count, as_number
 from shields.certificate import Certificate
 from shields.errors import Infeasible
-from shields.synthesis.certification import first_certificate
-from shields.synthesis.search import Search
+from shields.synthesis.certification import Search, first_certificate
+from shields.synthesis.invariant_polytope import Progress
 
 # Ages that are asked about by default [steps].
 AGES = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
@@ -94,7 +94,7 @@ def requirements(
     *,
     ages: Sequence[int] = AGES,
     resolutions: Sequence[float] = (0.0,),
-    progress: Callable[[str], object] = lambda line: None,
+    progress: Progress = lambda line: None,
 ) -> Requirements:
     """Returns under which contracts a plant has a certificate, each of them verified.
 

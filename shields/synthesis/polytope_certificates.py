@@ -27,6 +27,7 @@ from shields.synthesis.ellipsoid_certificates import MORE_DIGITS, failed_verific
 from shields.synthesis.invariant_polytope import (
     MARGINS,
     Feedback,
+    Progress,
     feedback_of,
     invariant_polytope,
     points_of_box,
@@ -39,7 +40,6 @@ from shields.synthesis.resting_point import (
     limits_around,
     needs_resting_point,
 )
-from shields.synthesis.search import Progress
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.tolerance import Tolerated, most_tolerant
 from shields.verification import verify
@@ -120,7 +120,10 @@ def _reach(faces: np.ndarray, L: np.ndarray) -> float:
 
 
 def _with_polytope_of(
-    feedback: Feedback, plant: LinearPlant, certificate_with: Callable[[Polytope], Certificate], progress: Progress
+    feedback: Feedback,
+    plant: LinearPlant,
+    certificate_with: Callable[[Polytope], Certificate],
+    progress: Progress,
 ) -> Certificate:
     """Returns a verified certificate with the polytope of a fallback, sought with one margin after the other.
 

@@ -34,7 +34,7 @@ _LEAST_PRICE = 1e-3
 
 
 def at_operating_point(plant: LinearPlant) -> Rest:
-    """Returns zero, where fallbacks of plants with symmetric limits rest."""
+    """Returns where fallbacks of plants with symmetric limits rest: zero."""
     return Rest(np.zeros(plant.n), np.zeros(plant.m))
 
 
@@ -46,12 +46,9 @@ def equilibria(plant: LinearPlant) -> np.ndarray:
 
 
 class LimitRows(NamedTuple):
-    """Limits low <= rows (x, u) <= high, in units of half their range: of the box, the inputs, of both together.
+    """Limits low <= rows (x, u) <= high, (r, n + m), in units of half their range: of the box, inputs, both together.
 
-    Attributes:
-        rows: Shape (r, n + m).
-        low, high: Shape (r,).
-        disturbed: Support of what has come by then of the disturbance, shape (r,); 0 but between samples.
+    `disturbed` is the support of what has come by then of the disturbance, shape (r,): 0 but between samples.
     """
 
     rows: np.ndarray

@@ -65,13 +65,9 @@ def regulators(plant: LinearPlant, decay: float = 1.0) -> list[np.ndarray]:
 
 
 class Tolerated(NamedTuple):
-    """A gain with the factor that all radii may grow by until it keeps no polytope within the limits.
+    """A gain, shape (m, n), and the margin that all radii may grow by until it keeps no polytope within the limits.
 
-    Attributes:
-        K: The gain, shape (m, n).
-        rest: Its resting point.
-        margin: The factor.
-        binding: The limits that are reached first, numbers of `limit_rows`.
+    The limits that bind are reached first, numbers of `limit_rows`.
     """
 
     K: np.ndarray
@@ -142,7 +138,7 @@ class Tolerance:
 
         def stop(z: np.ndarray) -> None:
             nonlocal best
-            tried = self.of(self._physical(z[: K.size].reshape(shape) * sizes))
+            tried = self.of(z[: K.size].reshape(shape) * sizes / self._x * self._u[:, None])
             if tried is not None and best is not None and tried.margin > best.margin:
                 best = tried
 
@@ -175,9 +171,6 @@ class Tolerance:
 
     def _scaled(self, K: np.ndarray) -> np.ndarray:
         return K * self._x / self._u[:, None]
-
-    def _physical(self, K: np.ndarray) -> np.ndarray:
-        return K / self._x * self._u[:, None]
 
     def _needs_and_slopes(self, K: np.ndarray, *, slopes: bool = True) -> tuple[np.ndarray, np.ndarray] | None:
         """Returns how far errors and disturbances take every limit from rest under a scaled gain, in half ranges, (r,).
@@ -226,13 +219,9 @@ def _support(rows: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 class InvariantEllipsoid(NamedTuple):
-    """The smallest ellipsoid that is invariant under a gain, in scaled coordinates.
+    """The smallest ellipsoid E(L), (n, n), that is invariant under a gain, (m, n), in scaled coordinates.
 
-    Attributes:
-        K: The gain, shape (m, n).
-        L: Shape of the set, (n, n); it respects the limits if `margin` >= 1.
-        multipliers: Multipliers (lx, le, ld) with which (I) holds.
-        margin: Factor by which all radii may grow before it breaks a limit.
+    Its multipliers are (lx, le, ld) of (I), its margin the factor that all radii may grow by before it breaks a limit.
     """
 
     K: np.ndarray

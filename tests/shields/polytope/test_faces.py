@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from shields.synthesis import faces as synthesis_faces
 from shields.synthesis.faces import Extremes, Faces, multipliers_of
 from tests.product import linear_plant, synthesize
 
@@ -96,3 +97,16 @@ def test_solvers_print_nothing(capfd):
     )  # fmt: skip
     assert synthesize(plant, safe_set="polytope").polytope is not None
     assert capfd.readouterr() == ("", "")
+
+
+def test_presolve_that_fails_is_repeated_without_one(monkeypatch):
+    polytope, row = faces_of(np.random.default_rng(0), 6, 2, symmetric=True), np.array([1.0, 0.5])
+    proved = multipliers_of(polytope, row)
+
+    def solved(*args, options, **others):
+        found = linprog(*args, options=options, **others)
+        found.status = 4 if options["presolve"] else found.status
+        return found
+
+    monkeypatch.setattr(synthesis_faces, "linprog", solved)
+    np.testing.assert_allclose(multipliers_of(polytope, row), proved, rtol=1e-9, atol=1e-12)

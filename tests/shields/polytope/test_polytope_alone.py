@@ -121,6 +121,13 @@ def test_polytope_that_fails_the_exact_check_is_sought_with_a_larger_margin(monk
     assert share_in_polytope(found.polytope, plant) <= share_in_polytope(checked[0].polytope, plant)
 
 
+def test_ellipsoid_inside_a_polytope_that_rounding_takes_out_of_it_is_shrunk(monkeypatch):
+    plant = servo(1.0)
+    K, rounded = most_tolerated(plant, AGE, polytope=True).K, polytope_certificates.shape_in_digits
+    monkeypatch.setattr(polytope_certificates, "shape_in_digits", lambda L: (1.0 + 5e-9) * rounded(L))
+    assert verified(certified_polytope(plant, K, AGE, at_operating_point(plant)), plant).valid
+
+
 def test_polytope_bears_more_than_an_ellipsoid():
     plant = servo(1.0)
     margin = most_tolerated(plant, AGE, polytope=True).margin

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -13,10 +12,10 @@ from experiments.commands.synthesize import SynthesizeSettings
 from experiments.commands.synthesize import synthesize as run_command
 from ncs_gym import ChannelContract
 from shields import Infeasible, verify
-from shields.synthesis import ellipsoid_certificates, invariant_polytope, search
+from shields.synthesis import certification, ellipsoid_certificates, invariant_polytope
 from shields.synthesis.design_problem import design_problem
 from shields.synthesis.invariant_set_program import InvariantSetProgram
-from tests.plants import random_plant
+from tests.plants import random_plant, servo
 from tests.product import linear_plant, synthesize
 from tests.verdicts import verified
 
@@ -47,8 +46,8 @@ def test_set_that_fails_the_exact_check_is_not_sought_again_and_a_polytope_is(lo
 
 
 def test_alternations_that_gain_less_than_a_percent_are_the_last_with_their_step():
-    env, lines = gym.make("ncs_gym/LaneKeeping-v0").unwrapped, []
-    synthesize(env.plant, contract=env.certificate_contract, safe_set="ellipsoid", progress=lines.append)
+    lines = []
+    synthesize(servo(0.8), contract=ChannelContract(0), safe_set="ellipsoid", progress=lines.append)
     volumes = [float(line.split()[6]) for line in lines if line.startswith("alternation")]
     small = [after < 1.0101 * before for before, after in pairwise(volumes)]
     assert sum(small) <= 3
@@ -68,7 +67,7 @@ def test_few_gains_whose_polytopes_have_too_many_rows_end_the_search(monkeypatch
 
 
 def test_best_certificate_in_time_is_verified_and_says_that_the_time_was_over(loaded, monkeypatch):
-    monkeypatch.setattr(search.time, "thread_time", Processor(1.0))
+    monkeypatch.setattr(certification.time, "thread_time", Processor(1.0))
     certificate = synthesize(loaded, time_limit=3.0)
     assert verified(certificate, loaded).valid
     told = "the synthesis was stopped at initial design, when the time_limit of 3 s was over: other sets may be"
@@ -77,7 +76,7 @@ def test_best_certificate_in_time_is_verified_and_says_that_the_time_was_over(lo
 
 def test_command_ends_after_a_minute_of_work(loaded, monkeypatch, tmp_path, capsys):
     loaded.save(tmp_path / "plant.json")
-    monkeypatch.setattr(search.time, "thread_time", Processor(20.0))
+    monkeypatch.setattr(certification.time, "thread_time", Processor(20.0))
     run_command(SynthesizeSettings(plant=tmp_path / "plant.json", out=tmp_path / "certificate.json"))
     assert "the time_limit of 60 s was over" in " ".join(capsys.readouterr().out.split())
 

@@ -78,10 +78,10 @@ def test_radii_that_a_refusal_names_have_a_certificate(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["bap_gepoc", "heli_tondel", "port_crane", "propofol", "tvc_rocket"])
-def test_published_plant_is_refused_in_time_if_it_is(name):
+@pytest.mark.parametrize("name", ["port_crane", "propofol", "quad12_osqp", "spacecraft", "tvc_rocket"])
+def test_published_plant_is_certified_or_refused_in_time(name):
     began = time.thread_time()
-    with contextlib.suppress(Infeasible):
+    with contextlib.nullcontext() if name != "tvc_rocket" else pytest.raises(Infeasible):
         synthesize(plant_of(name), contract=contract_of_plant(name))
     assert time.thread_time() - began < LONGEST_REFUSAL
 

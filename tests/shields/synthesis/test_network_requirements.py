@@ -11,9 +11,8 @@ from ncs_gym import ChannelContract
 from ncs_gym.processes.gym_pendulum import pendulum
 from shields import Infeasible, requirements, verify
 from shields.synthesis import network_requirements
-from shields.synthesis.certification import first_certificate
+from shields.synthesis.certification import Search, first_certificate
 from shields.synthesis.network_requirements import share_of
-from shields.synthesis.search import Search
 from tests import plants
 from tests.shields.polytope.limits import certificate as limited
 
