@@ -10,7 +10,7 @@ from experiments.baselines.observer import DisturbanceObserver
 from experiments.baselines.tuned import tuned_weights
 from ncs_gym.envs.env import ncs_env
 from shields import certificate_for
-from shields.runtime.safety_filter import SafetyFilter
+from tests.product import safety_filter
 
 CASE = "ncs_gym/CSTR-v0"
 STEPS, COUNT = 12, 3
@@ -77,7 +77,7 @@ def test_a_shield_with_one_error_set_lets_pass_what_is_safe_at_every_age():
     convoy = ncs_env(gym.make("ncs_gym/Convoy-v0"))  # of whose error sets none holds the others
     certificate = certificate_for(convoy.plant, convoy.certificate_contract)
     shield = OneErrorSet(certificate)(gym.make_vec("ncs_gym/Convoy-v0", num_envs=2))
-    rng, own = np.random.default_rng(0), SafetyFilter(certificate, convoy.plant)
+    rng, own = np.random.default_rng(0), safety_filter(certificate, convoy.plant)
     estimates = rng.uniform(-0.8, 0.8, (400, convoy.plant.n)) * convoy.plant.half_widths
     inputs = rng.uniform(*convoy.plant.input_ends, (400, convoy.plant.m))
     one = shield.filter.decide_many(estimates, certificate.error_shapes[0], inputs)
