@@ -279,10 +279,10 @@ RURAL, URBAN = Drive(1352, 0.20, 33.77, 1.00), Drive(34, 0.24, 0.43, 4.01)
 ROADS = {"rural": "Rural and off-road/*.txt", "urban": "Urban road/**/*_run*.txt"}
 
 
-def stalls(folder: Path) -> None:
+def stalls(folder: Path = Path("CICV5G/data")) -> None:
     """Stalls in the records of drives over 5G, by road: how many an hour, how long, and the tail of their lengths.
 
-    FOLDER is `data` of github.com/zxr805/CICV5G (Zhang et al. 2025, doi:10.5281/zenodo.17475688, CC BY 4.0), delays
+    --folder is `data` of github.com/zxr805/CICV5G (Zhang et al. 2025, doi:10.5281/zenodo.17475688, CC BY 4.0), delays
     from a car and back of packets that were sent every 50 ms.
     """
     show = table("road", "runs", "hours", "stalls/h", "shortest [s]", "longest [s]", "tail", first=8)
