@@ -363,17 +363,18 @@ def sides(limits: Any, size: int, name: str) -> np.ndarray:
     return both
 
 
-def _from_center(limits: Any, center: np.ndarray, name: str) -> np.ndarray:
-    """Returns the ends of a pair, shape (2, size), as distances from a point.
+def _from_center(limits: Any, center: np.ndarray, name: str, *, at_end: bool = False) -> np.ndarray:
+    """Returns the ends of a pair, shape (2, size), as distances from a point, which with `at_end` may be one of them.
 
     Raises:
-        ValueError: If it is no pair, or the point is not strictly between them, by more than rounding.
+        ValueError: If it is no pair, or the point is not between them, by more than rounding.
     """
     ends = sides(limits, len(center), name) - center
     finite = np.isfinite(ends)
     sizes = np.where(finite, np.array([[-1.0], [1.0]]) * ends, 1.0)
-    if not ((sizes > SMALLEST_NUMBER) & (sizes < LARGEST_NUMBER)).all():
-        form = "absolute, of usual size, the operating point, at=(state, input) of the Model, strictly between them"
+    if not (((sizes > SMALLEST_NUMBER) | (at_end & (sizes == 0.0))) & (sizes < LARGEST_NUMBER)).all():
+        between = "at an end or between them" if at_end else "strictly between them"
+        form = f"absolute, of usual size, the operating point, at=(state, input) of the Model, {between}"
         raise ValueError(f"{name} must be {form}: it is {shown(center.tolist())}, got {shown(limits)}")
     nearest = sizes.min(axis=0)
     nearly = finite.all(axis=0) & (np.abs(sizes[1] - sizes[0]) <= NEARLY_SYMMETRIC * nearest)
@@ -387,7 +388,7 @@ class Limits(ReadOnlyArrays):
     Attributes:
         state: Half-widths, a number or shape (n,), or a pair (low, high) of numbers or vectors, which of two states are
             vectors; infinite where there is no limit. None: no state has one of its own.
-        input: Alike, all finite.
+        input: Alike, all finite; an operating input that is given may be at an end, as of a heater that is off.
         rows: Limits of several entries, a list of (c_x, c_u, low, high) with low <= c_x x + c_u u <= high for the x at
             the beginning of a step and the u that is held then; c_u is None in a limit of states alone.
         rate: Largest change of each input from one step to the next, a positive number or shape (m,).
@@ -415,13 +416,13 @@ class Limits(ReadOnlyArrays):
         """Returns a model with these limits, counted from its point.
 
         Raises:
-            ValueError: If they are no limits of its states and inputs, or its point is not strictly within them.
+            ValueError: If they are no limits of its states and inputs, or its point is not within them.
         """
         point, (n, m) = np.concatenate([model.state, model.input]), model.B.shape
         of_states, mixed = [], []
         if self.state is not None:
             of_states.append(Rows.of(np.eye(n), _from_center(self._pair("state", model), model.state, "state limits")))
-        inputs = _from_center(self._pair("input", model), model.input, "input limits")
+        inputs = _from_center(self._pair("input", model), model.input, "input limits", at_end=model.at is not None)
         if not np.isfinite(inputs).all():
             raise ValueError(f"input limits must be finite, since actions span them, got {shown(self.input)}")
         for of_state, of_input, low, high in self.rows:

@@ -58,7 +58,8 @@ def starting_set(initial_set: Ellipsoid | None, plant: LinearPlant) -> Ellipsoid
         ValueError: If it is none, or of another dimension than the plant.
     """
     if initial_set is None:
-        box = plant.box / np.abs(plant.box_ends).min(axis=0)[:, None]
+        nearest = np.abs(plant.box_ends).min(axis=0)
+        box = plant.box / np.where(nearest > 0.0, nearest, 1.0)[:, None]  # past inputs that rest at an end start there
         is_bounded, widths = exact.rank(box) == plant.n, plant.half_widths
         gram = (box * widths).T @ (box * widths)
         shape = START_FRACTION**2 * (

@@ -16,7 +16,7 @@ from shields import CertificateError, Infeasible
 from shields.synthesis.resting_point import farthest_equilibrium, improved
 from shields.synthesis.tolerance import most_tolerated
 from tests.certificates import certificate_of
-from tests.product import altered, linear_plant, synthesize
+from tests.product import altered, linear_plant, loop_env, safety_shield, synthesize
 from tests.shields.polytope.limits import ANGLE, ASYMMETRIC, CONTRACT, PLANTS, QUIET, certificate
 from tests.verdicts import broken, verified
 
@@ -45,6 +45,28 @@ def test_limit_with_one_end_alone_is_kept():
     assert found.polytope.high[0] == np.inf
     reached = found.polytope.rows[1:] @ np.array([1e6])
     assert ((reached > found.polytope.high[1:]) | (reached < found.polytope.low[1:])).any()
+
+
+def test_an_input_may_rest_at_an_end_and_a_state_may_not():
+    """A heater that is off where the room is as cold as outside."""
+    described = {"A": [[0.99]], "B": [[0.1]], "dt": 60.0, "operating_state": 0.0, "operating_input": 0.0}
+    heater = linear_plant(
+        **described, state_limits=(-0.5, 8.0), input_limits=(0.0, 1.0), disturbance_bound=5e-3, **QUIET
+    )
+    found = certificate_of(heater, CONTRACT, "polytope")
+    assert verified(found, heater).valid
+    assert 0.0 < found.resting_input < 1.0
+    shield = safety_shield(loop_env(heater, contract=CONTRACT), found)
+    shield.reset(seed=0)
+    for proposed in np.random.default_rng(0).choice([-1.0, 1.0], 200):
+        info = shield.step(np.full(1, proposed, np.float32))[4]
+        assert info["shield_guaranteed"]
+        assert 0.0 <= info["input"][0] <= 1.0
+    late = loop_env(altered(heater, input_delay=1), contract=CONTRACT)
+    assert late.reset(seed=0)[1]["state"][1] == 0.0  # the past input
+    for limits in ({"state_limits": (0.0, 8.0), "input_limits": (0.0, 1.0)}, {"input_limits": (0.1, 1.0)}):
+        with pytest.raises(ValueError, match="the operating point"):
+            linear_plant(**described, **{"state_limits": (-0.5, 8.0)} | limits, disturbance_bound=5e-3, **QUIET)
 
 
 @pytest.mark.parametrize("name", ASYMMETRIC)
