@@ -53,11 +53,6 @@ class Belief(NamedTuple):
             return self.table.shape(self.number)
         return self.table.shapes.take(self.number, axis=0)
 
-    def column(self, loop: int) -> Belief:
-        """Returns what is known of one of N loops."""
-        one = (each.take(loop, axis=-1) if isinstance(each, np.ndarray) else each for each in self)
-        return self._make(each.item() if isinstance(each, np.generic) else each for each in one)
-
 
 def _loaded_belief(*values: Any) -> Belief:
     return Belief._make(frozen(each) if isinstance(each, np.ndarray) else each for each in values)

@@ -262,7 +262,8 @@ class LoopState(CopiedWhole, ABC):
         """
         starts, initial = self.start, self.loop.initial_set
         if chosen:
-            starts = [initial if np.isnan(start[0]) else start for start in starts[chosen[0]]]
+            drawn = np.isnan(starts[chosen[0], 0]).tolist()
+            starts = [initial if each else start for start, each in zip(starts[chosen[0]], drawn, strict=True)]
         earlier = [self.estimator.numbered(self.pending[:steps], *chosen) for steps in range(len(self.pending))]
         return starts, earlier, self.channels.now
 

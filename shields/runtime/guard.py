@@ -123,20 +123,29 @@ class Guard(CopiedWhole):
         self.belief, self.errors = belief, self._errors_of.of(belief.table, belief.number)
         none: Any = False
         if mask is None:
-            self._state, self.stored = self._started(belief, starts, earlier)
+            known = self._known_of(starts)
+            self.stored, is_safe = first_store(self.filter, belief.estimate, self.errors, known[-1])
+            self._state = self._covered(self._monitor.start(is_safe, belief, self.errors), [known], earlier)
             margin: Any = self.filter.margin(belief.estimate, self.errors, self._idle)
             self._interventions = self._proved = self._count = 0
         else:
             chosen, none = np.flatnonzero(mask), np.zeros(len(mask), np.bool_)
             self._leave(~mask & ((belief.moves != self._moves) | (self._asked > 0)))
-            self._state, self.stored = MonitorState(*map(np.array, self._state)), self.stored.copy()
-            self.stored[..., chosen] = np.nan
-            for k, (e, start) in enumerate(zip(chosen.tolist(), starts, strict=True)):
-                before = [(means[:, k].copy(), numbers.item(k)) for means, numbers in earlier]
-                state, plan = self._started(belief.column(e), start, before)
-                self.stored[: len(plan), :, e] = plan
-                for kept, new in zip(self._state, state, strict=True):
-                    kept[e] = new
+            all_known = [self._known_of(start) for start in starts]
+            is_safe = none.copy()
+            is_safe[chosen] = [known[-1].in_safe_set for known in all_known]
+            if self.filter.horizon:
+                self.stored = self.stored.copy()
+                self.stored[..., chosen] = np.nan
+                for e, known in zip(chosen.tolist(), all_known, strict=True):
+                    alone = belief.estimate[:, e].copy(), self.errors.single(e)
+                    plan, is_safe[e] = first_store(self.filter, *alone, known[-1])
+                    self.stored[: len(plan), :, e] = plan
+            all_started = self._monitor.start(is_safe, belief, self.errors)
+            started = MonitorState(*(np.broadcast_to(each, mask.shape)[chosen] for each in all_started))
+            self._state = MonitorState(*map(np.array, self._state))
+            for kept, new in zip(self._state, self._covered(started, all_known, earlier), strict=True):
+                kept[chosen] = new
             margin = self._decision.margin.copy()
             sets = self.filter.test.reachable(belief.estimate[:, chosen], self.errors.of(chosen))
             margin[chosen] = sets.margins(self._idle[:, chosen])[1]
@@ -148,21 +157,21 @@ class Guard(CopiedWhole):
             self._schedule.start(mask)
         self._decision, self._proposed = Decision(self._idle, none, none, none, margin, none), self._idle
 
-    def _started(
-        self, belief: Belief, start: Any, earlier: Sequence[tuple[np.ndarray, int]]
-    ) -> tuple[MonitorState, np.ndarray]:
-        """Returns what is known at the start of one episode, and the plan that is stored then."""
-        known, errors = self._known_of(start), self._errors_of.of(belief.table, belief.number)
-        plan, is_safe = first_store(self.filter, belief.estimate, errors, known[-1])
-        state = self._monitor.start(is_safe, belief, errors)
-        if self._schedule is None:
-            return state, plan
-        ahead = []
-        for each, (estimate, number) in zip(known[:-1], earlier, strict=True):
-            quiet = belief._replace(estimate=estimate, number=number, alarm=False, damaged=False, outside=False)
-            there = self._errors_of.of(belief.table, number)
-            ahead.append((known_inside(self.filter, each, estimate, there), quiet, there))
-        return self._monitor.cover(state, ahead), plan
+    def _covered(
+        self, state: MonitorState, known: list[tuple[StartKnown, ...]], earlier: Sequence[tuple[np.ndarray, Any]]
+    ) -> MonitorState:
+        """Returns the state at starts with what is known of the steps before the first decision takes effect."""
+        steps = []
+        for ahead, (estimate, number) in enumerate(earlier):
+            errors = self._errors_of.of(self.belief.table, number)
+            if self._size is None:
+                inside: Any = known_inside(self.filter, known[0][ahead], estimate, errors)
+            else:
+                alone = [(each[ahead], estimate[:, k].copy(), errors.single(k)) for k, each in enumerate(known)]
+                inside = np.array([known_inside(self.filter, *each) for each in alone], np.bool_)
+            quiet = self.belief._replace(estimate=estimate, number=number, alarm=False, damaged=False, outside=False)
+            steps.append((inside, quiet, errors))
+        return self._monitor.cover(state, steps) if steps else state
 
     def _known_of(self, start: Any) -> tuple[StartKnown, ...]:
         """Returns `starts_known`; of sets, which are read-only and recur, it is remembered: it takes long."""
