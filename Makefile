@@ -72,7 +72,7 @@ test-slow: $(INSTALLED) $(RAY_INSTALLED) $(AUDIT_INSTALLED) ## the long attacks,
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow
 
 # What CI has time for: that the synthesis still gives the certificates of the package, the paper's audit, the benchmark and a record as the
-# pages have them, hints, the same bits in every process, and what worker processes do.
+# pages have them, published plants, the same bits in every process, and what worker processes do.
 SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/commands/test_paper.py tests/test_suite.py \
 	tests/experiments/commands/test_requirements.py \
 	tests/test_published_plants.py \

@@ -14,7 +14,7 @@ from ncs_gym.estimation.arrival_histories import ErrorTable
 from ncs_gym.network.contract import largest_age, warn_of_broken_contract
 from ncs_gym.network.downlink import IDEAL_DOWNLINK, CommittedInputs, DownlinkProtocol
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
-from ncs_gym.validation import CopiedWhole
+from ncs_gym.validation import CopiedWhole, frozen
 from shields.runtime.guarantee import (
     ALARM,
     CODES,
@@ -80,31 +80,24 @@ class Guard(CopiedWhole):
         # What the last start was known to lie in, and what follows from it exactly.
         self._start: Any = None
         self._known: tuple[StartKnown, ...] = ()
+        # False, 0 and "" of one loop, arrays of many; nobody writes into them.
+        none: Any = False
+        zero: Any = 0
         self._no_reason: Any = ""
+        self.stored = np.empty((0, m))
+        if size is not None:
+            none, zero = np.zeros(size, np.bool_), np.zeros(size, np.int64)
+            self._no_reason = frozen(np.full(size, "", dtype=object))
+            self.stored = np.full((safety_filter.horizon or 0, m, size), np.nan)
         # What was decided last of what was proposed.
-        self._decision = Decision(self._idle, False, False, False, 0.0, "")
-        self._proposed = self._idle
+        self._decision, self._proposed = Decision(self._idle, none, none, none, 0.0 * zero, none), self._idle
+        self._state = MonitorState(zero, none, none, none, zero)
         # The clock of the loop when it was observed last, and how many inputs were decided since.
-        self._moves: Any = 0
+        self._moves: Any = zero
         self._asked = 0
         # What this episode has of interventions, of states and of those proved, and which loops the next `info` counts.
-        self._interventions: Any = 0
-        self._count: Any = 0
-        self._proved: Any = 0
+        self._interventions = self._count = self._proved = zero
         self._counted: Any = True
-        self.stored = np.empty((0, m))
-        self._state = MonitorState(0, False, False, False)
-        if size is not None:
-            none = np.zeros(size, np.bool_)
-            self._state = MonitorState(
-                np.zeros(size, np.int64), none, none.copy(), none.copy(), np.zeros(size, np.int64)
-            )
-            self._moves = np.zeros(size, np.int64)
-            self._interventions, self._proved, self._count = np.zeros((3, size), np.int64)
-            self.stored = np.full((safety_filter.horizon or 0, m, size), np.nan)
-            self._decision = Decision(self._idle, none, none, none, np.zeros(size), none)
-            self._no_reason = np.full(size, "", dtype=object)
-            self._no_reason.flags.writeable = False
 
     belief: Belief
     errors: PredictedErrors
