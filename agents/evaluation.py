@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 
 from agents.loop import LoopConfig
 from agents.results import Episode, Evaluation
-from ncs_gym import NCSVectorEnv
+from ncs_gym import Ellipsoid, NCSVectorEnv
 from ncs_gym.envs.env import ncs_env
 from shields.polytope import Polytope
 
@@ -29,7 +29,7 @@ def evaluate(
     policy: Policy,
     episodes: int,
     seed: int,
-    safe_set: np.ndarray | Polytope | None = None,
+    safe_set: Ellipsoid | Polytope | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
     """Returns what a policy does in a number of episodes, played side by side.
@@ -39,7 +39,7 @@ def evaluate(
         policy: Maps observations and infos to actions.
         episodes: How many, at least 1.
         seed: Seed of all random numbers (see `Episode.index`).
-        safe_set: M, shape (n, n), or a polytope, for `Episode.times_safe_set`.
+        safe_set: For `Episode.times_safe_set`.
         on_progress: Called with the number of steps taken since its last call.
 
     Raises:
@@ -63,7 +63,7 @@ def _played(
     policy: Policy,
     indices: range,
     seed: int,
-    safe_set: np.ndarray | Polytope | None,
+    safe_set: Ellipsoid | Polytope | None,
     on_progress: Callable[[int], None] | None,
 ) -> list[Episode]:
     count, envs = len(indices), loop.vector(len(indices))
@@ -84,11 +84,8 @@ def _played(
     totals = {name: np.zeros(count, np.int64) for name in names}
     while True:
         guaranteed &= info.get("shield_guaranteed", nothing).astype(np.bool_) | ~running
-        if isinstance(safe_set, Polytope):
+        if safe_set is not None:
             largest = np.maximum(largest, np.where(running, safe_set.gauge(info["state"]), 0.0))
-        elif safe_set is not None:
-            levels = np.einsum("ei,ij,ej->e", info["state"], safe_set, info["state"])
-            largest = np.maximum(largest, np.where(running, np.sqrt(np.maximum(levels, 0.0)), 0.0))
         running &= ~ended
         if not running.any():
             break

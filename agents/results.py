@@ -43,8 +43,8 @@ class Episode:
         violation_steps: Steps after which the true state violated the safe box.
         estimate_violation_steps: Steps after which the estimate was outside the safe box.
         interventions: Steps in which the shield intervened, or would have in mode "monitor".
-        times_safe_set: The true state came to this many times the safe set: the root of the largest x'Mx, or the
-            largest gauge in a polytope; above 1 it was outside. NaN unless `evaluate` was given a `safe_set`.
+        times_safe_set: The true state came to this many times the safe set, its largest gauge; above 1 it was outside.
+            NaN unless `evaluate` was given a `safe_set`.
         planned: Steps after whose decision the shield of mode "lookahead" had inputs of a certified plan in store.
         guaranteed: Whether the shield's guarantee held at every step; False without a shield.
         proved: Steps after which the shield's guarantee held.

@@ -1,4 +1,4 @@
-"""The certificate: an invariant ellipsoid, its gain, and a list of proofs, one per error set; and its file."""
+"""The certificate: an invariant set, its gain, and a list of proofs, one per error set; and its file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from ncs_gym.validation import FILLED_IN_LATER, ReadOnlyArrays, as_matrix, as_se
 from shields.certificate_text import (
     contract_text,
     counted,
-    missing_polytope_of,
     provenance_rows,
     size_of,
     table,
@@ -26,9 +25,11 @@ from shields.documents import content_of, document_of, write_document
 from shields.errors import CertificateError
 from shields.polytope import Polytope, polytope_content, polytope_of
 
-_FORMAT = "ncs-gym certificate 3"
+_FORMAT = "ncs-gym certificate 4"
 # Parts of a point that are smaller than this share of the set are shown as zero.
 _DUST = 1e-9
+# Fields of a `Proof` with an ellipsoid, and those of `Updates` that are arrays.
+_OF_ELLIPSOID, _OF_UPDATES = ("shares", "inputs"), ("last", "gains", "shares", "noise")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -38,9 +39,9 @@ class Proof(ReadOnlyArrays):
     Attributes:
         Sigma: Shape of the error set, (n, n).
         rate: Multiplier lam of (E1), in (0, 1), under a contract of (C1): with no sample the error is in the next set.
-        shares: Multipliers lx, le, ld > 0 of state, estimation error and disturbance in (I), at most 1 together, shape
-            (3,); None if the state is kept in the certificate's polytope alone, whose multipliers are of (P) and (PU).
-        inputs: Multipliers mu_i in (0, 1) of the input limits (U), shape (m,); None with `shares`.
+        shares: Of an ellipsoid: multipliers lx, le, ld > 0 of state, estimation error and disturbance in (I), at most 1
+            together, shape (3,). None with a polytope, which has multipliers of its own.
+        inputs: Of an ellipsoid: multipliers mu_i in (0, 1) of the input limits (U), shape (m,).
     """
 
     Sigma: np.ndarray
@@ -122,18 +123,16 @@ class Fallback(NamedTuple):
 class Certificate(ReadOnlyArrays):
     """A robust control invariant set S inside the safe box, its gain, and the numbers that prove it.
 
-    S is the polytope if there is one, else E(L). Where the gain keeps a polytope but no ellipsoid, E(L) around
-    `resting_state` is merely an ellipsoid inside (`keeps_ellipsoid`). A certificate is not trusted until
-    `shields.verify` has checked it in exact arithmetic. Two are equal if their files are, in every digit.
+    It is not trusted until `shields.verify` has checked it in exact arithmetic. Two are equal if their files are, in
+    every digit.
 
     Attributes:
-        L: Shape of the ellipsoid E(L), (n, n) [squares of the states' units].
+        safe_set: S, which a shield keeps: an ellipsoid E(L) around zero, or a polytope around `resting_state`.
         K: Gain of the fallback input, shape (m, n) [input per state].
         proofs: Under a channel contract one for each age 0..h of the newest sample, otherwise a single one.
         D: Shape of the disturbance set that the proofs assume, (n, n).
-        rounding: Multiplier s > 0 of D_u, which is D enlarged by the rounding of actions to float32.
+        rounding: Of an ellipsoid: multiplier s > 0 of D_u, which is D enlarged by the rounding of actions to float32.
         updates: What a channel contract adds to the proofs; None without a contract.
-        polytope: Around `resting_state`, invariant under the same gain; None without one.
         resting_state: x_c of the fallback input u = u_c + K (x_hat - x_c), shape (n,): an equilibrium without
             estimation error and disturbance; zero, the plant's operating point, by default.
         resting_input: u_c, shape (m,).
@@ -143,13 +142,12 @@ class Certificate(ReadOnlyArrays):
         provenance: How the certificate was made (solver, versions, volume); it proves nothing.
     """
 
-    L: np.ndarray
+    safe_set: Ellipsoid | Polytope
     K: np.ndarray
     proofs: tuple[Proof, ...]
     D: np.ndarray
-    rounding: float
+    rounding: float | None = None
     updates: Updates | None = None
-    polytope: Polytope | None = None
     resting_state: np.ndarray = FILLED_IN_LATER
     resting_input: np.ndarray = FILLED_IN_LATER
     between_samples: int | None = None
@@ -159,9 +157,10 @@ class Certificate(ReadOnlyArrays):
     def __post_init__(self) -> None:
         try:
             self._check_fields()
-            n = len(as_matrix(self.L, (None, None), "L"))
-            self._set(L=as_matrix(self.L, (n, n), "L"), K=as_matrix(self.K, (None, n), "K"))
-            self._set(D=as_matrix(self.D, (n, n), "D"), rounding=float(_as_array(self.rounding, (), "rounding")))
+            n = self.safe_set.dim
+            self._set(K=as_matrix(self.K, (None, n), "K"), D=as_matrix(self.D, (n, n), "D"))
+            if self.rounding is not None:
+                self._set(rounding=float(_as_array(self.rounding, (), "rounding")))
             for name, size in (("resting_state", n), ("resting_input", len(self.K))):
                 value = getattr(self, name)
                 self._set(**{name: np.zeros(size) if value is None else as_vector(value, size, name)})
@@ -173,7 +172,9 @@ class Certificate(ReadOnlyArrays):
     def _check_fields(self) -> None:
         if not (isinstance(self.provenance, dict) and isinstance(self.fingerprint, str)):
             raise ValueError("its provenance must be a dict, and its fingerprint a text")
-        for name, kind in (("updates", Updates), ("polytope", Polytope), ("between_samples", int)):
+        if not isinstance(self.safe_set, Ellipsoid | Polytope):
+            raise ValueError("its safe set must be an Ellipsoid or a Polytope")
+        for name, kind in (("updates", Updates), ("between_samples", int)):
             value = getattr(self, name)
             if value is not None and type(value) is not kind:
                 raise ValueError(f"its {name} must be of type {kind.__name__}")
@@ -185,39 +186,16 @@ class Certificate(ReadOnlyArrays):
             raise ValueError(f"it must have {ages} proofs, one per error set, got {len(self.proofs)}")
         for Sigma in (*(proof.Sigma for proof in self.proofs), *self.next_error_shapes):
             as_matrix(Sigma, (n, n), "Sigma")
-        if len({proof.shares is None for proof in self.proofs}) > 1:
-            raise ValueError("either all of its proofs have multipliers of (I), or none has")
-        if self.polytope is None:
-            if not self.keeps_ellipsoid:
-                raise ValueError("its proofs have no multipliers of (I), and it has no polytope")
-        elif self.polytope.dim == n and not np.array_equal(self.polytope.center, self.resting_state):
-            raise ValueError("its polytope must be around its resting state")
-
-    @cached_property
-    def M(self) -> np.ndarray:
-        """The inverse of L, shape (n, n)."""
-        inverse = np.linalg.inv(self.L)
-        return read_only(0.5 * (inverse + inverse.T))
+        S, of_ellipsoid = self.safe_set, [*(proof.shares for proof in self.proofs), self.rounding]
+        if any((each is None) != isinstance(S, Polytope) for each in of_ellipsoid):
+            raise ValueError("multipliers of (I) and of rounding belong to an ellipsoid, which needs all of them")
+        if not np.array_equal(self.resting_state, S.center if isinstance(S, Polytope) else np.zeros(n)):
+            raise ValueError("its safe set must be around its resting state")
 
     @property
     def fallback(self) -> Fallback:
         """The input that keeps the state in the safe set."""
         return Fallback(self.K, self.resting_state, self.resting_input)
-
-    @cached_property
-    def ellipsoid(self) -> Ellipsoid:
-        """E(L), of deviations from `resting_state`."""
-        return Ellipsoid(self.L)
-
-    @property
-    def keeps_ellipsoid(self) -> bool:
-        """Whether E(L) is claimed to be invariant; otherwise the polytope alone is."""
-        return all(proof.shares is not None for proof in self.proofs)
-
-    @property
-    def safe_set(self) -> Ellipsoid | Polytope:
-        """S, the set that a shield keeps."""
-        return self.ellipsoid if self.polytope is None else self.polytope
 
     @property
     def contract(self) -> ChannelContract | None:
@@ -265,20 +243,19 @@ class Certificate(ReadOnlyArrays):
         return f"<Certificate for the plant {self.fingerprint[:16]}, {self.contract or 'without a contract'}>"
 
     def __str__(self) -> str:
-        (m, n), recorded, points = self.K.shape, self.provenance, self.between_samples
+        (m, n), recorded, points, kept = self.K.shape, self.provenance, self.between_samples, self.safe_set
         claim = f"at all times ({points} of each step, and a bound on what is between them)"
         if points is None:
             claim = "at the sampling instants; nothing is claimed of the times between them"
-        safe_set = ""
-        if self.polytope is not None:
-            inside = "inside it the ellipsoid" if self.keeps_ellipsoid else "inside it, not invariant, the ellipsoid"
-            kind = "|g x| <= 1" if self.polytope.is_symmetric else "low <= g x <= high"
-            safe_set = f"the polytope {kind} of {len(self.polytope.rows)} rows g; {inside} "
-        sizes = np.sqrt(np.diag(self.L))
-        widths = ", ".join(f"{width:.4g}" for width in sizes)
-        ellipsoid, fallback = "x'Mx <= 1, that reaches |x_i|", "u = K x_hat"
+        if isinstance(kept, Polytope):
+            form = "|g x| <= 1" if kept.is_symmetric else "low <= g x <= high"
+            safe_set, sizes = f"the polytope {form} of {len(kept.rows)} rows g", np.nan_to_num(kept.widths, posinf=0.0)
+        else:
+            sizes = np.sqrt(np.diag(kept.shape_matrix))
+            widths = ", ".join(f"{width:.4g}" for width in sizes)
+            safe_set = f"the ellipsoid x'Mx <= 1, that reaches |x_i| <= {widths}"
+        fallback = "u = K x_hat"
         if self.resting_state.any() or self.resting_input.any():
-            ellipsoid = "(x - x_c)'M(x - x_c) <= 1, that reaches |x_i - x_c,i|"
             x_c, u_c = (
                 ", ".join(f"{0.0 if abs(each) <= _DUST * size else each:.4g}" for each, size in zip(*of, strict=True))
                 for of in ((self.resting_state, sizes), (self.resting_input, np.abs(self.K) @ sizes))
@@ -286,21 +263,18 @@ class Certificate(ReadOnlyArrays):
             fallback = f"u = u_c + K (x_hat - x_c), with x_c = ({x_c}) and u_c = ({u_c}) from the operating point"
         rows = [
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
-            ("safe set", f"{safe_set}{ellipsoid} <= {widths}"),
+            ("safe set", safe_set),
             ("claim", f"in the safe box {claim}"),
-            ("size", size_of(self)),
-            ("polytope", missing_polytope_of(recorded) if self.polytope is None else ""),
+            ("size", size_of(recorded)),
             ("fallback", fallback),
             ("contract", contract_text(self.contract)),
             *provenance_rows(recorded),
         ]
         return table("Certificate of a robust control invariant set (shields.verify checks it)", rows)
 
-    def without_polytope(self) -> Certificate:
-        """Returns the certificate of the ellipsoid alone; raises CertificateError if it does not keep the ellipsoid."""
-        of_polytopes = ("polytope_share_of_box", "no_polytope", "reach")
-        kept = {name: value for name, value in self.provenance.items() if name not in of_polytopes}
-        return replace(self, polytope=None, provenance=kept)
+    def recording(self, known: dict[str, Any]) -> Certificate:
+        """Returns the same certificate, whose provenance says more."""
+        return replace(self, provenance=self.provenance | known)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a JSON file in which every float is exact; a reader never sees a partial file.
@@ -350,56 +324,45 @@ class Certificate(ReadOnlyArrays):
 
 
 def _content_of(certificate: Certificate) -> dict[str, Any]:
-    """Returns the content of a file: `ages` has the arrays of all ages, of which the largest is repeated before."""
-    c, ages = certificate, None
-    if (updates := c.updates) is not None:
-        sets = {
-            "shapes": [*c.error_shapes.tolist(), updates.last.tolist()],
-            "rates": [proof.rate for proof in c.proofs],
-            **{name: getattr(updates, name).tolist() for name in ("gains", "shares", "noise")},
-        }
-        by_age = {name: [_listed(getattr(proof, name)) for proof in c.proofs] for name in ("shares", "inputs")}
-        ages = {"contract": asdict(updates.contract), "sets": sets, **by_age}
-    proof, names = c.proofs[-1], ("state", "estimate", "disturbance")
-    shares = dict.fromkeys(names) if proof.shares is None else dict(zip(names, proof.shares.tolist(), strict=True))
-    optional = {} if c.polytope is None else {"polytope": polytope_content(c.polytope)}
-    optional |= {} if c.between_samples is None else {"between_samples": c.between_samples}
-    if c.resting_state.any() or c.resting_input.any():
-        optional |= {"resting_state": c.resting_state.tolist(), "resting_input": c.resting_input.tolist()}
-    return optional | {
-        "L": c.L.tolist(),
+    """Returns the content of a file; lists of proofs are by age."""
+    c, proofs, updates = certificate, certificate.proofs, certificate.updates
+    if isinstance(c.safe_set, Polytope):
+        safe_set = polytope_content(c.safe_set)
+    else:
+        by_age = {name: [getattr(proof, name).tolist() for proof in proofs] for name in _OF_ELLIPSOID}
+        safe_set = {"L": c.safe_set.shape_matrix.tolist()} | by_age | {"rounding": c.rounding}
+    return {
+        "safe_set": safe_set,
         "K": c.K.tolist(),
-        "Sigma": c.Sigma.tolist(),
         "D": c.D.tolist(),
-        "multipliers": shares | {"error": proof.rate, "inputs": _listed(proof.inputs), "rounding": c.rounding},
-        "ages": ages,
+        "errors": {"shapes": c.error_shapes.tolist(), "rates": [proof.rate for proof in proofs]},
+        "updates": updates
+        and {"contract": asdict(updates.contract)} | {name: getattr(updates, name).tolist() for name in _OF_UPDATES},
+        "resting_state": c.resting_state.tolist(),
+        "resting_input": c.resting_input.tolist(),
+        "between_samples": c.between_samples,
         "fingerprint": c.fingerprint,
         "provenance": c.provenance,
     }
 
 
-def _listed(array: np.ndarray | None) -> list[float] | None:
-    return None if array is None else array.tolist()
-
-
 def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
     """Raises KeyError, TypeError or ValueError if an entry is missing or of a wrong kind."""
-    fields = {name: content[name] for name in ("L", "K", "D", "fingerprint", "provenance")}
-    Sigma, ages, stated = content["Sigma"], content["ages"], content["multipliers"]
-    fields["rounding"] = stated["rounding"]
-    fields |= {name: content.get(name) for name in ("between_samples", "resting_state", "resting_input")}
-    if content.get("polytope") is not None:
-        fields["polytope"] = polytope_of(content["polytope"], fields["resting_state"])
-    shares = [stated[name] for name in ("state", "estimate", "disturbance")]
-    own = Sigma, stated["error"], None if shares == [None] * 3 else shares, stated["inputs"]
-    rows: list[tuple[Any, Any, Any, Any]] = [own]
-    if ages is not None:
-        sets = ages["sets"]
-        *shapes, last = sets["shapes"]
-        rows = list(zip(shapes, sets["rates"], ages["shares"], ages["inputs"], strict=True))
-        by_age = {name: sets[name] for name in ("gains", "shares", "noise")}
-        fields["updates"] = Updates(contract=ChannelContract(**ages["contract"]), last=last, **by_age)
-    fields["proofs"] = tuple(Proof(Sigma=Sigma, rate=rate, shares=shares, inputs=u) for Sigma, rate, shares, u in rows)
+    names = ("K", "D", "resting_state", "resting_input", "between_samples", "fingerprint", "provenance")
+    fields = {name: content[name] for name in names}
+    kept, errors, updates = content["safe_set"], content["errors"], content["updates"]
+    shapes, rates = errors["shapes"], errors["rates"]
+    if "L" in kept:
+        fields |= {"safe_set": Ellipsoid(kept["L"]), "rounding": kept["rounding"]}
+        multipliers = [kept[name] for name in _OF_ELLIPSOID]
+    else:
+        fields["safe_set"] = polytope_of(kept, fields["resting_state"])
+        multipliers = [[None] * len(shapes)] * 2
+    found = zip(shapes, rates, *multipliers, strict=True)
+    fields["proofs"] = tuple(Proof(Sigma=Sigma, rate=rate, shares=shares, inputs=u) for Sigma, rate, shares, u in found)
+    if updates is not None:
+        contract = ChannelContract(**updates["contract"])
+        fields["updates"] = Updates(contract=contract, **{name: updates[name] for name in _OF_UPDATES})
     return fields
 
 

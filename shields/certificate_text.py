@@ -13,7 +13,7 @@ from ncs_gym.plants.linear_plant import row_limit
 from ncs_gym.validation import counted, printable
 
 if TYPE_CHECKING:
-    from shields.certificate import Certificate
+    pass
 
 _WIDTH, _INDENT = 80, 14
 
@@ -53,23 +53,18 @@ def reach_in(safe_set: Any, plant: LinearPlant) -> tuple[Reach, ...]:
     )
 
 
-def size_of(certificate: Certificate) -> str:
+def size_of(recorded: dict[str, Any]) -> str:
     """Returns the recorded shares of the safe box and of the largest ellipsoid in it, or else the recorded reach."""
-    recorded = certificate.provenance
-    polytope_share, reach = recorded.get("polytope_share_of_box"), recorded.get("reach")
-    of_box = "{:.4g} %" if polytope_share else "{:.4g} % of the safe box's volume"
     at_rest = "{:.4g} % of the volume of the safe box of the states, with no input under way"
-    ellipsoid = (
-        _text(recorded.get("share_of_box"), of_box, 100.0),
+    reach = recorded.get("reach")
+    reached = ", ".join(each for each in reach if isinstance(each, str)) if isinstance(reach, list) else ""
+    sizes = (
+        _text(recorded.get("share_of_box"), "{:.4g} % of the safe box's volume", 100.0),
         _text(recorded.get("share_of_box_at_rest"), at_rest, 100.0),
+        reached and f"up to {reached}",
         _text(recorded.get("volume_of_box_ellipsoid"), "{:.4g} % of the largest ellipsoid in the box", 100.0),
     )
-    size = ", ".join(filter(None, ellipsoid))
-    reached = ", ".join(each for each in reach if isinstance(each, str)) if isinstance(reach, list) else ""
-    kept = _text(polytope_share, "{:.3g} % of the safe box's volume", 100.0) or (reached and f"up to {reached}")
-    if certificate.polytope is not None and size:
-        size = f"the ellipsoid {size}"
-    return "; ".join(filter(None, [kept, size]))
+    return ", ".join(filter(None, sizes))
 
 
 def table(title: str, rows: list[tuple[str, str]]) -> str:
@@ -98,14 +93,9 @@ def provenance_rows(recorded: dict[str, Any]) -> list[tuple[str, str]]:
     given, stage = recorded.get("assumptions"), recorded.get("interrupted_at")
     assumed = " ".join(each for each in given if isinstance(each, str)) if isinstance(given, list) else ""
     stopped = f"the synthesis was stopped at {stage}: other sets may be larger" if isinstance(stage, str) else ""
-    tolerance = _text(recorded.get("tolerated_scale"), scale)
-    return [("tolerance", tolerance), ("assumes", assumed), ("interrupted", stopped)]
-
-
-def missing_polytope_of(recorded: dict[str, Any]) -> str:
-    """Returns why there is no polytope."""
-    reason = recorded.get("no_polytope")
-    return f"none: {reason}; shields keep the state in the ellipsoid" if isinstance(reason, str) else "none was sought"
+    tolerance, missing = _text(recorded.get("tolerated_scale"), scale), recorded.get("no_polytope")
+    polytope = f"none: {missing}; shields keep the state in the ellipsoid" if isinstance(missing, str) else ""
+    return [("polytope", polytope), ("tolerance", tolerance), ("assumes", assumed), ("interrupted", stopped)]
 
 
 def _text(value: Any, pattern: str, scale: float = 1.0) -> str:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ncs_gym import LinearPlant
+from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
 from ncs_gym.network.channel import in_time
@@ -206,22 +206,21 @@ class _Supports:
     """Bounds of the values of rows in S, around the resting point, which do not depend on units."""
 
     def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
-        kept, self._center = certificate.safe_set, certificate.resting_state
-        self._ellipsoid, self._polytope = certificate.ellipsoid, None
+        self._set = kept = certificate.safe_set
         if isinstance(kept, Polytope):
-            faces, shift = faces_of(kept, len(plant.box)), kept.rows @ self._center
+            faces, shift = faces_of(kept, len(plant.box)), kept.rows @ kept.center
             assert faces is not None  # it was verified
             self._units = (1.0 + 1e-9) * np.array([float(each) for each in faces.widths])  # |y_i| is at most as large
-            self._polytope = Extremes(Faces(kept.rows * self._units, kept.low - shift, kept.high - shift))
+            self._extremes = Extremes(Faces(kept.rows * self._units, kept.low - shift, kept.high - shift))
 
     def of(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns them for rows, shape (q, n): two arrays of shape (q,)."""
-        if self._polytope is None:
-            reach, shift = _support(rows, self._ellipsoid.shape_matrix), rows @ self._center
-            return -reach - shift, reach - shift
+        if isinstance(self._set, Ellipsoid):
+            reach = _support(rows, self._set.shape_matrix)
+            return -reach, reach
         rows, reach = rows * self._units, np.ones(rows.shape[1])
         sizes = np.abs(rows).max(axis=1)
-        bounds = [self._polytope.bounds(row / (size or 1.0), reach) for row, size in zip(rows, sizes, strict=True)]
+        bounds = [self._extremes.bounds(row / (size or 1.0), reach) for row, size in zip(rows, sizes, strict=True)]
         least, largest = np.array(bounds).T * sizes
         return least, largest
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
-from ncs_gym import LinearPlant, NCSVectorEnv
+from ncs_gym import Ellipsoid, LinearPlant, NCSVectorEnv
 from shields import Certificate
+from shields.polytope import Polytope
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
 from shields.runtime.rows_within_step import closed, rows_within_step
@@ -33,8 +34,8 @@ Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 class CertaintyEquivalentFilter:
     """Decides as the shield does, with Sigma_k = 0 in the place of the true error ellipsoid, and so without a proof.
 
-    The margin is the fraction of the safe set that is kept free after the next step: margin^2 L in the place of
-    A Sigma_k A', where states can be off at all (past inputs are known).
+    The margin is the fraction of the safe box that is kept free after the next step: margin^2 W^-1, of the ellipsoid
+    x'W x <= 1 inside it, in the place of A Sigma_k A', where states can be off at all (past inputs are known).
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
@@ -43,7 +44,7 @@ class CertaintyEquivalentFilter:
     def __init__(self, certificate: Certificate, plant: LinearPlant, margin: float = 0.0) -> None:
         self._filter = SafetyFilter(certificate, plant)
         unknown, back = np.arange(plant.n) < plant.n - plant.past, np.linalg.pinv(plant.A)
-        off = margin**2 * np.where(np.outer(unknown, unknown), certificate.L, 0.0)
+        off = margin**2 * np.where(np.outer(unknown, unknown), np.linalg.inv(plant.weight), 0.0)
         self._assumed = self._filter.errors_of_many((back @ off @ back.T)[None])
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
@@ -96,18 +97,17 @@ class PredictiveFilter:
         require_valid(certificate, plant)
         self._plant, self._fallback, self._horizon = plant, certificate.fallback, horizon
         self._plans = np.empty((0, horizon - 1, plant.m))
-        polytope = certificate.polytope
-        self._root = np.linalg.cholesky(certificate.M).T if polytope is None else polytope.rows
-        self._ends_in_ellipsoid = polytope is None
-        self._prediction = Prediction(certificate_test(certificate, plant), horizon)
+        test, S = certificate_test(certificate, plant), certificate.safe_set
+        self._root, self._ends_in_ellipsoid = test.root, isinstance(S, Ellipsoid)
+        self._prediction = Prediction(test, horizon)
         self._program = PlanProgram(self._prediction)
         self._middle, half = _middle_and_half(*plant.box_ends)
         at_samples = np.tile(half - margin, (horizon + 1, 1))
         self._end_middle, end_half, to_face = np.zeros(1), np.ones(1), np.ones(1)
-        if polytope is not None:
-            self._end_middle, end_half = _middle_and_half(polytope.low, polytope.high)
-            reached = polytope.rows @ polytope.center
-            to_face = np.minimum(polytope.high - reached, reached - polytope.low)
+        if isinstance(S, Polytope):
+            self._end_middle, end_half = _middle_and_half(S.low, S.high)
+            reached = S.rows @ S.center
+            to_face = np.minimum(S.high - reached, reached - S.low)
         self._end_limits = end_half - margin * to_face
         if tube:
             if len(plant.mixed_rows):
@@ -123,9 +123,9 @@ class PredictiveFilter:
         shrunk = self._prediction.half[:k]
         self._all_limits[:-1, :k] = shrunk - 1.0 + (self._limits + (1.0 - half)) * longer
         self._all_limits[-1, :ends] = self._end_limits
-        if polytope is not None:  # its first rows are those of the box
+        if isinstance(S, Polytope):  # its first rows are those of the box
             self._all_limits[-1, :k] += shrunk - half
-        self._weighting = self._root if polytope is None else self._root[:0]
+        self._weighting = self._root[: test.cone]
         self._grid = rows_within_step(plant)
         self._grid_middle, grid_half = _middle_and_half(self._grid.low, self._grid.high)
         times = (len(grid_half) - len(plant.mixed_rows)) // k

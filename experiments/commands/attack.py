@@ -20,6 +20,7 @@ from ncs_gym import AdversarialDisturbance, Channel, ChannelContract, LinearPlan
 from ncs_gym.registration import EPISODE_STEPS, registered_ids
 from ncs_gym.validation import counted
 from shields import Certificate, VectorSafetyShield, certificate_for
+from shields.polytope import Polytope
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +115,8 @@ def channels_of(own: Channel, contract: ChannelContract | None) -> dict[str, Cha
 
 def worst_case(certificate: Certificate, mode: str = "project") -> dict[str, Any]:
     """Returns settings of environments that push states out of the safe set, in mode "lookahead" out of the box."""
-    push = {"M": certificate.M} if certificate.polytope is None else {"rows": certificate.polytope.rows}
+    S = certificate.safe_set
+    push = {"rows": S.rows} if isinstance(S, Polytope) else {"M": np.linalg.inv(S.shape_matrix)}
     return {"noise": "extreme", "disturbance": AdversarialDisturbance(**({} if mode == "lookahead" else push))}
 
 
@@ -128,7 +130,7 @@ def hostile_agents(
     certificate: Certificate, plant: LinearPlant, count: int, rng: np.random.Generator
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Returns what makes actions (N, m) of estimates (N, n): random, outwards, the gain turned round, bang-bang."""
-    outwards = (plant.B.T @ certificate.M @ plant.A).T
+    outwards = (plant.B.T @ plant.weight @ plant.A).T
     turned = -1e3 * (certificate.K / plant.input_half[:, None]).T
     signs, kinds = rng.choice([-1.0, 1.0], (count, plant.m)), 4 * np.arange(count)[:, None] // count
 

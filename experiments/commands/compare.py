@@ -81,7 +81,7 @@ def compare(settings: CompareSettings) -> None:
     certificate = certificate_of(loop, settings.certificate, settings.safe_set)
     claim_folder("compare", settings.completed)
     verification = verify(certificate, ncs_env(loop.single()).plant)
-    size = size_of(certificate)
+    size = size_of(certificate.provenance)
     held = f"certificate: {len(verification.conditions)} conditions hold in exact arithmetic"
     print(wrapped(f"{held} ({size})" if size else held), flush=True)
     if is_any_trained(settings, names):

@@ -80,7 +80,7 @@ def evaluate(settings: EvaluateSettings) -> None:
         lambda observations, infos: agent.act(observations),
         settings.episodes,
         settings.seed,
-        certificate.polytope or certificate.M,
+        certificate.safe_set,
     )
     shield_name = mode or "none"
     result = RunResult(shield_name, 0, 0, 0, 0, [], evaluated.episodes)

@@ -138,6 +138,7 @@ def designs() -> list[StateFeedback]:
     example = PaperExample()
     plant = example.plant
     ours = synthesize(plant, safe_set="ellipsoid")
+    assert isinstance(ours.safe_set, Ellipsoid)
     scale = _OP_SCALE * largest_scale(FeasibilityScan(plant), plant)
     Q, P0 = scale * plant.process_noise_cov, scale * plant.initial_cov
     scaled = with_noise(plant, gamma=scale * plant.gamma, Q=Q, P0=P0)
@@ -145,7 +146,7 @@ def designs() -> list[StateFeedback]:
     box = BoxDisturbance((1.0 - 1e-9) * scale**0.5 * np.asarray(CASE_STUDY_BOX.half_widths))
     return [
         StateFeedback("printed", plant, CASE_STUDY_BOX, example.L, example.K, example.epsilon),
-        StateFeedback("certified", plant, CASE_STUDY_BOX, ours.L, ours.K, None),
+        StateFeedback("certified", plant, CASE_STUDY_BOX, ours.safe_set.shape_matrix, ours.K, None),
         StateFeedback(f"OP at {scale:.3f} of the bounds", scaled, box, op.L, op.K, op.epsilon),
     ]
 

@@ -165,7 +165,7 @@ class TrainingRun:
             from agents import untrained
 
             agent = untrained(self.loop, self.training_seed, self.algorithm, self.settings)
-        safe_set, played = self.certificate.polytope or self.certificate.M, {}
+        safe_set, played = self.certificate.safe_set, {}
         for name in (AS_TRAINED, *self.scenarios):
             loop, policy = under(name, self.loop), _policy(self, agent)  # a random policy begins anew each time
             found = evaluate(loop, policy, self.episodes, self.evaluation_seed, safe_set, on_progress)

@@ -15,6 +15,7 @@ from ncs_gym.estimation.error_bound import ErrorSet, require_error_set
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from ncs_gym.validation import ReadOnlyArrays
 from shields.certificate import Certificate, CertificateError, Updates
+from shields.polytope import Polytope
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
 
 # A residual beyond its bound by less than this, relative to it, counts as rounding, not as an alarm.
@@ -164,8 +165,9 @@ class BoardTable(ReadOnlyArrays):
 
 def _exported(certificate: Certificate, plant: LinearPlant) -> Updates:
     """Returns what a contract adds to a certificate; raises CertificateError if its kind is not exported."""
+    is_polytope = isinstance(certificate.safe_set, Polytope)
     reasons = {
-        "it has no polytope: give one of ncs synthesize --safe-set polytope": certificate.polytope is None,
+        "it has no polytope: give one of ncs synthesize --safe-set polytope": not is_polytope,
         "it has no channel contract: give one of ncs synthesize --max-age": certificate.updates is None,
         "its plant has a remainder": plant.remainder is not None,
         "its box counts between samples": plant.grid_rows is not None,

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ncs_gym import ChannelContract, LinearPlant
+from ncs_gym import ChannelContract, Ellipsoid, LinearPlant
 from shields.certificate import Certificate
+from shields.polytope import Polytope
 
 # Most syntheses are over before anybody wonders [s].
 _SILENT_SECONDS = 3.0
@@ -35,19 +36,20 @@ def certificate_for(
     """
     key = plant.fingerprint, contract, safe_set
     if key not in _made:
-        found = certificate_of_package(plant, contract)
-        if found is None:
-            found = _synthesized(plant, contract, safe_set)
-        _made[key] = found.without_polytope() if safe_set == "ellipsoid" else found
+        found = certificate_of_package(plant, contract, safe_set)
+        _made[key] = _synthesized(plant, contract, safe_set) if found is None else found
     return _made[key]
 
 
-def certificate_of_package(plant: LinearPlant, contract: ChannelContract | None = None) -> Certificate | None:
+def certificate_of_package(
+    plant: LinearPlant, contract: ChannelContract | None = None, safe_set: str | None = None
+) -> Certificate | None:
     """Returns the certificate that comes with the package for a plant and a contract; None if there is none."""
+    kind = Ellipsoid if safe_set == "ellipsoid" else Polytope
     for file in sorted(Path(__file__).parent.glob("*.json")):
         if plant.fingerprint in file.read_text(encoding="utf-8"):
             certificate = Certificate.load(file)
-            if certificate.contract == contract:
+            if certificate.contract == contract and isinstance(certificate.safe_set, kind):
                 return certificate
     return None
 

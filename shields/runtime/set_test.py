@@ -17,6 +17,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside
 from ncs_gym.validation import frozen, read_only
 from shields.certificate import Certificate, CertificateError
+from shields.polytope import Polytope
 from shields.runtime.projection import closest_admissible, closest_between, closest_in_interval, closest_on_line
 from shields.runtime.rows_within_step import closed, rows_within_step, supports
 from shields.verification import ACTION_ROUNDING
@@ -462,15 +463,15 @@ def norms(vectors: np.ndarray) -> np.ndarray:
 
 
 def certificate_test(certificate: Certificate, plant: LinearPlant) -> SetTest:
-    """Returns the test of the set that a certificate keeps: of its polytope, or of its ellipsoid if it has none.
+    """Returns the test of the set that a certificate keeps.
 
     Raises:
         CertificateError: If the ellipsoid is so thin that no norm computed in float64 provably describes it.
     """
-    if certificate.polytope is not None:
-        P = certificate.polytope
-        return SetTest(plant, np.empty((0, plant.n)), P.rows, P.low, P.high)
-    return ellipsoid_test(certificate.L, plant)
+    S = certificate.safe_set
+    if isinstance(S, Polytope):
+        return SetTest(plant, np.empty((0, plant.n)), S.rows, S.low, S.high)
+    return ellipsoid_test(S.shape_matrix, plant)
 
 
 def ellipsoid_test(L: np.ndarray, plant: LinearPlant) -> SetTest:
@@ -501,9 +502,8 @@ def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
 
     D_u allows a shift by 2^-24 u_max, twice what rounding an action to float32 does; the other half is for this.
     """
-    extent = np.sqrt(np.diag(certificate.L))
-    if certificate.polytope is not None:
-        extent = np.maximum(extent, certificate.polytope.widths)
+    S = certificate.safe_set
+    extent = S.widths if isinstance(S, Polytope) else np.sqrt(np.diag(S.shape_matrix))
     extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
     extent = extent + 2.0 * np.abs(certificate.resting_state)
     sizes = np.abs(certificate.K) @ extent + np.abs(certificate.resting_input)

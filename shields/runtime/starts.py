@@ -15,6 +15,7 @@ from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.estimation.kalman_filter import enlarged_by_rounding
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields.certificate import Certificate
+from shields.polytope import Polytope
 from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
 from shields.runtime.set_test import PredictedErrors
@@ -47,14 +48,14 @@ def starts_inside(certificate: Certificate, initial: Ellipsoid | np.ndarray) -> 
     """Returns whether all possible starts lie in the safe set of a certificate, decided in exact arithmetic.
 
     Args:
-        certificate: Gives its polytope, or S = E(L).
+        certificate: Gives S.
         initial: An ellipsoid E(X), inside S exactly if L - X >= 0; or a single state, shape (n,), inside S exactly if
             [1, x'; x, L] >= 0. Either is inside a polytope exactly if it is between all its pairs of faces.
     """
-    if certificate.polytope is not None:
-        P = certificate.polytope
-        return _between(P.rows, P.low, P.high, initial)
-    L = rational(certificate.L)
+    S = certificate.safe_set
+    if isinstance(S, Polytope):
+        return _between(S.rows, S.low, S.high, initial)
+    L = rational(S.shape_matrix)
     if isinstance(initial, Ellipsoid):
         return is_positive_semidefinite(subtract(L, rational(initial.shape_matrix)))
     state = rational(initial)[0]

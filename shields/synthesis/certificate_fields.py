@@ -31,12 +31,13 @@ def certificate_of(
     L, K = problem.to_physical(design.L, design.K)
     L, K = shape_in_digits(L), gain_in_digits(K, plant)
     return Certificate(
-        L=L,
+        safe_set=Ellipsoid(L),
         K=K,
         proofs=proofs_of(errors, problem, design),
-        **fields_of_problem(plant, problem, errors),
-        provenance=provenance_of(plant, L),
-    )
+        D=inflated(plant.disturbance.shape_matrix),
+        rounding=problem.rounding,
+        **fields_of_plant(plant, errors),
+    ).recording(ellipsoid_size(plant, L))
 
 
 def proofs_of(
@@ -67,26 +68,24 @@ def _updates(errors: ErrorSet) -> Updates | None:
     )
 
 
-def fields_of_problem(plant: LinearPlant, problem: DesignProblem, errors: ErrorSet) -> dict[str, Any]:
-    """Returns the fields of a certificate that set and gain have no part in."""
+def fields_of_plant(plant: LinearPlant, errors: ErrorSet) -> dict[str, Any]:
+    """Returns the fields of a certificate that set and gain have no part in, with how it was made."""
+    solver = f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}"
+    known: dict[str, Any] = {"source": "docs/shield_proof.md", "solver": solver}
     return {
-        "D": inflated(plant.disturbance.shape_matrix),
-        "rounding": problem.rounding,
         "updates": _updates(errors),
         "between_samples": plant.between_samples,
         "fingerprint": plant.fingerprint,
+        "provenance": known | ({"assumptions": list(plant.assumptions)} if plant.assumptions else {}),
     }
 
 
-def provenance_of(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
-    """Returns how a certificate was made, and what its reader wants to know of its ellipsoid, (n, n), and its plant."""
-    solver = f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}"
-    known: dict[str, Any] = {"source": "docs/shield_proof.md", "solver": solver}
+def ellipsoid_size(plant: LinearPlant, L: np.ndarray) -> dict[str, Any]:
+    """Returns the record of how large an ellipsoid, shape (n, n), is."""
     volume, share = _volume_of(plant, L), share_of_box(plant, L)
     sizes = ({} if math.isnan(volume) else {"volume_of_box_ellipsoid": volume}) | share
-    known |= {name: float(exact.rounded(size, _SHOWN_DIGITS)) for name, size in sizes.items()}
-    known |= {} if share else reach_recorded(Ellipsoid(L), plant)
-    return known | ({"assumptions": list(plant.assumptions)} if plant.assumptions else {})
+    known = {name: float(exact.rounded(size, _SHOWN_DIGITS)) for name, size in sizes.items()}
+    return known | ({} if share else reach_recorded(Ellipsoid(L), plant))
 
 
 def share_of_box(plant: LinearPlant, L: np.ndarray) -> dict[str, float]:

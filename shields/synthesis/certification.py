@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -50,8 +49,7 @@ class Search:
         best = None if self.candidate is None else self.candidate()
         if best is None or not verify(best, plant).valid:
             raise Infeasible(f"{over} at {self._stage}, before a certificate was found: give more, or None", "T", 0.0)
-        stopped = {"interrupted_at": f"{self._stage}, when {over}"}
-        return replace(best, provenance=best.provenance | stopped)
+        return best.recording({"interrupted_at": f"{self._stage}, when {over}"})
 
 
 @np.errstate(all="ignore")
@@ -134,8 +132,7 @@ def first_certificate(
                 failure = failure or none
             else:
                 if found is not None:
-                    recorded = found.provenance | {"tolerated_scale": float(exact.rounded(scale, 3))}
-                    return replace(found, provenance=recorded)
+                    return found.recording({"tolerated_scale": float(exact.rounded(scale, 3))})
         failure = failure or infeasibility(plant, most_tolerated(plant, contract, polytope=False), polytope=False)
     except Infeasible as none:
         failure = none

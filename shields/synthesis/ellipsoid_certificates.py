@@ -134,7 +134,7 @@ def _over_between_samples(certificate: Certificate, plant: LinearPlant) -> np.nd
         return np.ones(len(plant.box_rows))
     if grid.high.min() <= 0.0:
         raise _leaves_between_samples(1.0)
-    reach = np.sqrt(((grid.rows @ certificate.L) * grid.rows).sum(axis=1)) / grid.high
+    reach = certificate.safe_set.support(grid.rows) / grid.high
     over = reach.reshape(-1, len(plant.box_rows)).max(axis=0)
     left = over.max() > 1.0 - 0.1 * _BETWEEN_MARGIN
     return np.maximum(over / (1.0 - _BETWEEN_MARGIN), 1.0) if left else np.ones(len(over))

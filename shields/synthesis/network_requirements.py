@@ -75,13 +75,9 @@ class Requirements:
 
 def share_of(certificate: Certificate) -> tuple[str, float]:
     """Returns what fills how much of the safe box: "ellipsoid", "polytope", or ("certificate", 1.0) if not known."""
-    known, polytope = certificate.provenance, certificate.polytope
-    if polytope is not None and not certificate.keeps_ellipsoid and not polytope.is_symmetric:
-        share = known.get("polytope_share_of_box")
-        return ("certificate", 1.0) if share is None else ("polytope", float(share))
-    names = ("share_of_box", "share_of_box_at_rest", "volume_of_box_ellipsoid")
+    known, names = certificate.provenance, ("share_of_box", "share_of_box_at_rest", "volume_of_box_ellipsoid")
     share = next((known[name] for name in names if name in known), None)
-    return ("certificate", 1.0) if share is None else ("ellipsoid", float(share))
+    return ("certificate", 1.0) if share is None else (type(certificate.safe_set).__name__.lower(), float(share))
 
 
 def _cell(certificate: Certificate | None) -> str:

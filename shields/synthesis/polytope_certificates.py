@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 
 from ncs_gym import LinearPlant, exact
 from ncs_gym.network.contract import ChannelContract
-from shields.certificate import Certificate
+from shields.certificate import Certificate, Proof
 from shields.errors import Infeasible
 from shields.polytope import Polytope
 from shields.synthesis.certificate_fields import (
-    fields_of_problem,
+    fields_of_plant,
     gain_in_digits,
     proofs_of,
-    provenance_of,
     reach_recorded,
-    shape_in_digits,
 )
 from shields.synthesis.design_problem import Rest, design_problem
 from shields.synthesis.diagnosis import infeasibility
@@ -40,36 +38,33 @@ from shields.synthesis.resting_point import (
     limits_around,
     needs_resting_point,
 )
-from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.synthesis.tolerance import Tolerated, most_tolerant
 from shields.verification import verify
 
-# The largest ellipsoid in a polytope is shrunk to this in its faces, more than its digits are rounded by; a thin one,
-# of which rounding takes half of that, once more.
-_INSIDE, _THIN_INSIDE = 1.0 - 1e-9, 1.0 - 1e-4
 # Points of the box by which resting points are compared.
 _POINTS_OF_REST_LOG2 = 12
 # For so many gains a polytope is sought.
 _MOST_SOUGHT = 4
+# What is recorded of an ellipsoid's size.
+_SIZES = ("share_of_box", "share_of_box_at_rest", "volume_of_box_ellipsoid", "reach")
 # What ends the search for a polytope: a reason, or numbers that a linear program cannot hold.
 _NOT_CERTIFIED = (ArithmeticError, ValueError)
 
 
 def with_polytope(certificate: Certificate, plant: LinearPlant, progress: Progress = lambda line: None) -> Certificate:
-    """Returns a verified certificate with the largest polytope that its gain keeps in the box.
+    """Returns a verified certificate of the largest polytope that the gain of an ellipsoid keeps in the box.
 
-    One that keeps a polytope alone is returned as it is. If none is found, the provenance, and so the printed
-    certificate, says why.
+    If none is found, it is that of the ellipsoid, whose provenance, and so the printed certificate, says why.
     """
-    if not certificate.keeps_ellipsoid:
+    if isinstance(certificate.safe_set, Polytope):
         return certificate
+    kept = {name: value for name, value in certificate.provenance.items() if name not in _SIZES}
+    proofs = [Proof(Sigma=each.Sigma, rate=each.rate) for each in certificate.proofs]
+    rows_alone = partial(replace, certificate, proofs=proofs, rounding=None, provenance=kept)
     try:
-        return _with_polytope_of(
-            feedback_of(certificate), plant, lambda polytope: replace(certificate, polytope=polytope), progress
-        )
+        return _with_polytope_of(feedback_of(certificate), plant, rows_alone, progress)
     except _NOT_CERTIFIED as failure:
-        reason = reason_of(failure)
-    return replace(certificate, provenance=certificate.provenance | {"no_polytope": reason})
+        return certificate.recording({"no_polytope": reason_of(failure)})
 
 
 def reason_of(failure: Exception) -> str:
@@ -88,44 +83,33 @@ def certified_polytope(
 ) -> Certificate:
     """Returns a verified certificate with the largest polytope that a given gain keeps in the box.
 
-    The polytope alone is claimed to be invariant; L is that of the largest ellipsoid inside it, and inside generous
-    limits where states have none. The gain K is of shape (m, n) [input per state].
+    The gain K is of shape (m, n) [input per state].
 
     Raises:
         ArithmeticError, ValueError: If there is none; the message says why.
     """
-    limits = limits_around(plant, rest)
-    problem, errors = design_problem(plant, contract, limits)
+    errors = design_problem(plant, contract, limits_around(plant, rest))[1]
     K, proofs = gain_in_digits(K, plant), proofs_of(errors)
     feedback = Feedback(K, np.array([proof.Sigma for proof in proofs]), disturbance_around(plant, rest), rest)
-    others: dict[str, Any] = fields_of_problem(plant, problem, errors) | {"D": feedback.D}
-    others |= {"K": K, "proofs": proofs, "resting_state": rest.state, "resting_input": rest.input}
-
-    def certificate(polytope: Polytope) -> Certificate:
-        faces = polytope.F
-        inside = polytope.rows if polytope.is_symmetric else faces
-        if exact.rank(plant.box) < plant.n:  # a polytope may have no end, or a very far one, where a state has no limit
-            inside = np.concatenate([inside, limits.box_rows])
-        L = largest_box_ellipsoid(inside)
-        L = shape_in_digits(L * (_INSIDE / _reach(faces, L)))
-        L = L if _reach(faces, L) < 0.5 * (1.0 + _INSIDE) else shape_in_digits(_THIN_INSIDE * L)
-        return Certificate(L=L, polytope=polytope, provenance=provenance_of(plant, L), **others)
-
+    certificate = partial(
+        Certificate,
+        K=K,
+        proofs=proofs,
+        D=feedback.D,
+        resting_state=rest.state,
+        resting_input=rest.input,
+        **fields_of_plant(plant, errors),
+    )
     return _with_polytope_of(feedback, plant, certificate, progress)
-
-
-def _reach(faces: np.ndarray, L: np.ndarray) -> float:
-    """Returns the largest f L f' of faces, shape (q, n): E(L) lies between them if it is at most 1."""
-    return float(((faces @ L) * faces).sum(axis=1).max())
 
 
 def _with_polytope_of(
     feedback: Feedback,
     plant: LinearPlant,
-    certificate_with: Callable[[Polytope], Certificate],
+    certificate: Callable[..., Certificate],
     progress: Progress,
 ) -> Certificate:
-    """Returns a verified certificate with the polytope of a fallback, sought with one margin after the other.
+    """Returns a verified certificate, made with `safe_set`, of a fallback's polytope, sought with several margins.
 
     Raises:
         ArithmeticError, ValueError: If there is none; the message says why the first is.
@@ -141,7 +125,7 @@ def _with_polytope_of(
                 break  # a larger margin leaves less
             continue
         try:
-            return _verified_polytope(certificate_with(polytope), plant)
+            return _verified_polytope(certificate(safe_set=polytope), polytope, plant)
         except _NOT_CERTIFIED as none:
             failure = failure or none
     assert failure is not None
@@ -194,17 +178,15 @@ def _by_share(
     return gains
 
 
-def _verified_polytope(certificate: Certificate, plant: LinearPlant) -> Certificate:
-    """Returns a certificate with a polytope, verified, with the polytope's size.
+def _verified_polytope(certificate: Certificate, polytope: Polytope, plant: LinearPlant) -> Certificate:
+    """Returns the certificate of a polytope, verified, with its size.
 
     Raises:
         Infeasible: If it does not verify.
     """
-    assert certificate.polytope is not None
     report = verify(certificate, plant)
     if not report.valid:
         raise failed_verification(report)
-    others = {name: value for name, value in certificate.provenance.items() if name != "reach"}
-    if (share := share_in_polytope(certificate.polytope, plant)) is None:
-        return replace(certificate, provenance=others | reach_recorded(certificate.polytope, plant))
-    return replace(certificate, provenance=others | {"polytope_share_of_box": float(exact.rounded(share, 3))})
+    if (share := share_in_polytope(polytope, plant)) is None:
+        return certificate.recording(reach_recorded(polytope, plant))
+    return certificate.recording({"share_of_box": float(exact.rounded(share, 3))})

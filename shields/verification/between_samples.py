@@ -8,7 +8,7 @@ from math import ceil
 
 import numpy as np
 
-from ncs_gym import LinearPlant
+from ncs_gym import Ellipsoid, LinearPlant
 from shields.certificate import Certificate
 from shields.verification.condition import Condition, flag, scalar_condition
 from shields.verification.polytope_conditions import ends_from, faces_of, reach_of_error, root_above, widths_of
@@ -32,8 +32,8 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
     """Checks the claim of a certificate about times between samples; nothing where neither it nor the plant has one.
 
     (G): between the points of the plant's grid nothing is larger than at them by more than eta, which also covers that
-    the rows of the grid are rounded. (B) on S and (PB) on the polytope: with u = K x_hat, |c x| stays so far below 1 at
-    every point of the grid.
+    the rows of the grid are rounded. (B), or (PB) of a polytope: with u = K x_hat, |c x| stays so far below 1 at every
+    point of the grid.
     """
     rows, model, points = plant.grid_rows, plant.continuous_model, plant.between_samples
     if certificate.between_samples is None and points is None:
@@ -65,29 +65,29 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
 
 
 def _closed_loop_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (B), and (PB) if there is a polytope: with the fallback every point of the grid is inside.
+    """Checks (B) of an ellipsoid, (PB) of a polytope: with the fallback every point of the grid is inside.
 
     All is counted from the resting point, at which c x has a value of its own at every time.
     """
-    rows, polytope, k = plant.grid_rows, certificate.polytope, len(plant.box)
+    rows, S, k = plant.grid_rows, certificate.safe_set, len(plant.box)
     assert rows is not None
-    L, K, D = rational(certificate.L), rational(certificate.K), rational(certificate.D)
+    K, D, reach = rational(certificate.K), rational(certificate.D), reach_of_error(certificate, plant)
     x_c, u_c = rational(certificate.resting_state), rational(certificate.resting_input)
-    faces, reach = None if polytope is None else faces_of(polytope, k), reach_of_error(certificate, plant)
+    faces = None if isinstance(S, Ellipsoid) else faces_of(S, k)
     for j, row in enumerate(rational(plant.box)):
         taken = Fraction(float(rows.remainder[j])) + root_above(quadratic([row], D))
         for i in range(len(rows.state)):
             moved, pushed = rational(rows.state[i, j]), rational(rows.input[i, j])
             image = add(moved, multiply(pushed, K))[0]
-            least = taken + reach(pushed[0])
-            at_rest = multiply(moved, transpose(x_c))[0][0] + multiply(pushed, transpose(u_c))[0][0]
-            if certificate.keeps_ellipsoid:  # symmetric limits
-                on_ellipsoid = 1 - least - root_above(quadratic([image], L))
-                yield scalar_condition(f"(B) |c x| + rho <= 1 - eta on S at tau_{i} of row {j + 1}", on_ellipsoid)
-            if faces is not None:
+            if isinstance(S, Ellipsoid):  # within symmetric limits
+                name, left = "(B)", 1 - root_above(quadratic([image], rational(S.shape_matrix)))
+            else:
+                assert faces is not None  # (P) holds
+                at_rest = multiply(moved, transpose(x_c))[0][0] + multiply(pushed, transpose(u_c))[0][0]
                 ends = ends_from(plant.box_ends[:, j], at_rest)
-                left = faces.left_of(image, len(faces.rows) + plant.m + i * k + j, *ends) - least
-                yield scalar_condition(f"(PB) |c x| + rho <= 1 - eta on the polytope at tau_{i} of row {j + 1}", left)
+                name, left = "(PB)", faces.left_of(image, len(faces.rows) + plant.m + i * k + j, *ends)
+            claim = f"{name} |c x| + rho <= 1 - eta on S at tau_{i} of row {j + 1}"
+            yield scalar_condition(claim, left - taken - reach(pushed[0]))
 
 
 def _remainder(row: list[Fraction], grid: Matrix, G: Matrix, sizes: list[Fraction], dt: Fraction) -> Fraction | None:

@@ -13,7 +13,7 @@ from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate, Updates
 from shields.verification.between_samples import between_conditions
 from shields.verification.condition import ACTION_ROUNDING, Condition, flag, matrix_condition, scalar_condition
-from shields.verification.polytope_conditions import faces_of, polytope_conditions
+from shields.verification.polytope_conditions import polytope_conditions
 from shields.verification.rational_matrix import (
     Matrix,
     add,
@@ -29,43 +29,42 @@ from shields.verification.rational_matrix import (
 def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[Condition]:
     """Returns all conditions; only those of shapes or multipliers where these are wrong: others prove nothing then."""
     updates = certificate.updates
-    fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
+    S, fits = certificate.safe_set, certificate.K.shape == (plant.m, plant.n)
     fits = fits and all(proof.inputs is None or len(proof.inputs) == plant.m for proof in certificate.proofs)
     fits = fits and (updates is None or updates.gains.shape[1:] == (plant.n, plant.p))
-    fits = fits and (certificate.polytope is None or certificate.polytope.dim == plant.n)
-    conditions = [flag("shapes: L (n, n), K (m, n), rows of a polytope (r, n), one input multiplier per input", fits)]
+    conditions = [flag("shapes: K (m, n), gains of updates (n, p), one multiplier of an ellipsoid per input", fits)]
     if not fits:
         return conditions
-    rests_at_zero = not (certificate.resting_state.any() or certificate.resting_input.any())
-    if certificate.keeps_ellipsoid and not (plant.is_symmetric and rests_at_zero):
+    if isinstance(S, Ellipsoid) and not (plant.is_symmetric and not certificate.resting_input.any()):
         return [*conditions, flag("S: an ellipsoid is kept only around zero, within symmetric limits", False)]
     conditions += _multiplier_conditions(certificate)
     if all(condition.holds for condition in conditions):
         conditions += _bound_conditions(certificate, plant)
         conditions += _error_conditions(certificate, plant)
-        conditions += _safe_set_conditions(certificate, plant)
-        if certificate.polytope is not None:
-            conditions += polytope_conditions(certificate.polytope, certificate, plant)
+        if isinstance(S, Ellipsoid):
+            conditions += _ellipsoid_conditions(S, certificate, plant)
+        else:
+            conditions += polytope_conditions(S, certificate, plant)
         if all(condition.holds for condition in conditions):
             conditions += between_conditions(certificate, plant)
     return conditions
 
 
 def _multiplier_conditions(certificate: Certificate) -> Iterator[Condition]:
-    proofs, rounding = certificate.proofs, certificate.rounding
+    proofs, rounding = certificate.proofs, [] if certificate.rounding is None else [certificate.rounding]
     fractions = [proof.rate for proof in proofs]
     fractions += [mu for proof in proofs if proof.inputs is not None for mu in proof.inputs.tolist()]
     if certificate.updates is not None:
         fractions += certificate.updates.shares.tolist()
     triples = [proof.shares.tolist() for proof in proofs if proof.shares is not None]
-    finite = bool(np.isfinite([*fractions, rounding]).all() and np.isfinite(triples).all())
+    finite = bool(np.isfinite([*fractions, *rounding]).all() and np.isfinite(triples).all())
     yield flag("multipliers: finite", finite)
     if not finite:
         return
     inside = all(0.0 < multiplier < 1.0 for multiplier in fractions)
     yield flag("multipliers: 0 < lam_e < 1 and 0 < mu_i < 1", inside)
     exact = [[Fraction(share) for share in shares] for shares in triples]
-    positive = min([Fraction(rounding), *(min(shares) for shares in exact)]) > 0
+    positive = all(each > 0 for each in (*rounding, *(min(shares) for shares in exact)))
     yield flag("multipliers: lx, le, ld, s > 0", positive)
     smallest_margin = min((1 - sum(shares, Fraction(0)) for shares in exact), default=Fraction(0))
     yield scalar_condition("multipliers: lx + le + ld <= 1", smallest_margin)
@@ -158,27 +157,19 @@ def _update_conditions(
         yield matrix_condition(name, subtract(first, updated))
 
 
-def _safe_set_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (I), (S), (U): the ellipsoid is invariant and in the box, and the fallback respects the input limits.
-
-    Where the polytope alone is claimed to be invariant, only that the ellipsoid lies in it.
-    """
-    L, K, B = rational(certificate.L), rational(certificate.K), rational(plant.B)
+def _ellipsoid_conditions(S: Ellipsoid, certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
+    """Checks (I), (S), (U): the ellipsoid is invariant and in the box, and the fallback respects the input limits."""
+    L, K, B = rational(S.shape_matrix), rational(certificate.K), rational(plant.B)
     yield matrix_condition("L > 0", L, strict=True)
-    if not certificate.keeps_ellipsoid and certificate.polytope is not None:
-        faces = faces_of(certificate.polytope, len(plant.box))
-        for i, (row, *pair) in enumerate(zip(faces.rows, faces.low, faces.high, strict=True) if faces else ()):
-            nearest = min(abs(end) for end in pair if end is not None)
-            yield scalar_condition(f"(L) g L g' <= 1 of row {i + 1}", nearest**2 - quadratic([row], L))
-        return
     BK, D, s = multiply(B, K), certificate.D, certificate.rounding
+    assert s is not None  # of a certificate with an ellipsoid
     D_u = _with_action_rounding(rational(D), B, plant.u_max, Fraction(s))
     closed_loop = congruence(add(rational(plant.A), BK), L)
     for j, row in enumerate(plant.box_rows):
         yield scalar_condition(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
     for age, proof in enumerate(certificate.proofs):
         label = "" if certificate.updates is None else f" at age {age}"
-        assert proof.shares is not None  # `keeps_ellipsoid`
+        assert proof.shares is not None
         assert proof.inputs is not None
         Sigma, (lx, le, ld) = rational(proof.Sigma), map(Fraction, proof.shares.tolist())
         successors = add(scale(1 / lx, closed_loop), scale(1 / le, congruence(BK, Sigma)), scale(1 / ld, D_u))
