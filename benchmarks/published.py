@@ -30,6 +30,7 @@ from ncs_gym.registration import EPISODE_STEPS
 from shields import Certificate, Infeasible, VectorSafetyShield, reach_of, synthesize, verify
 from shields.export import BoardTable, export_c
 from shields.export.board_filter import GUARANTEED
+from shields.polytope import Polytope
 from shields.synthesis.invariant_polytope import points_of_box
 
 # From so many points, a power of two, inputs are sought that keep the limits for so many steps.
@@ -123,13 +124,19 @@ def shares(names: Names = ()) -> None:
             show(name, *known, f"none ({infeasible.binding})", "", "", f"{time.process_time() - began:.1f}")
             continue
         took, found = f"{time.process_time() - began:.1f}", found + 1
-        share, at_most = certificate.provenance.get("polytope_share_of_box"), largest_share(plant)
+        share, at_most = certificate.provenance.get("share_of_box"), largest_share(plant)
         if share is None or at_most is None:
             reached = [end for each in reach_of(certificate, plant) for end in (each.low, each.high) if end is not None]
             kept = f"to {min(reached):.1f} %", ""
         else:
             kept = f"{share:.3f}", f"{at_most:.2f}"
-        show(name, *known, *kept, "" if certificate.polytope is None else len(certificate.polytope.rows), took)
+        show(
+            name,
+            *known,
+            *kept,
+            len(certificate.safe_set.rows) if isinstance(certificate.safe_set, Polytope) else "",
+            took,
+        )
     print(f"{found} of {len(names or published())} have a certificate")
 
 
@@ -310,8 +317,8 @@ def _attacked_board(
     c: Any, table: BoardTable, plant: LinearPlant, certificate: Certificate, steps: int
 ) -> tuple[int, int, float]:
     """Returns guaranteed steps, how many were outside, and how far the state got, 1 at the boundary of the set."""
-    rng, polytope, (n, m, _, h, _) = np.random.default_rng(0), certificate.polytope, table.sizes.values()
-    assert polytope is not None
+    rng, polytope, (n, m, _, h, _) = np.random.default_rng(0), certificate.safe_set, table.sizes.values()
+    assert isinstance(polytope, Polytope)
     memory = np.zeros(2 * (2 * n + (h + 1) * m) + 16, np.int32)
     reason, (low, high) = memory[2 * (2 * n + (h + 1) * m) + 5 :], plant.input_ends  # after five counters
     u, guaranteed, outside, farthest, oldest, mixes = np.zeros(m), 0, 0, 0.0, 0, False

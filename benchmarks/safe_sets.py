@@ -83,15 +83,11 @@ def sections(out: Path = Path("safe-sets.png"), ids: Sequence[str] = IDS) -> Non
         panels = np.atleast_1d(figure.subplots(1, len(ids)))
         for axes, name in zip(panels, ids, strict=True):
             env = _env(name)
-            plant, certificate = env.plant, synthesize(env.plant, contract=env.certificate_contract)
-            plane, sets = (
-                PLANES.get(name, (0, 1)),
-                {"ellipsoid": certificate.ellipsoid, "polytope": certificate.polytope},
-            )
+            plant, plane = env.plant, PLANES.get(name, (0, 1))
             reaches: dict[str, Callable[[np.ndarray], float]] = {"upper bound": Viability(plant).reach}
-            reaches |= {
-                kind: lambda v, each=each: 1.0 / each.gauge(v) for kind, each in sets.items() if each is not None
-            }
+            for kind in ("ellipsoid", "polytope"):
+                kept = synthesize(plant, contract=env.certificate_contract, safe_set=kind).safe_set
+                reaches[kind] = lambda v, kept=kept: 1.0 / kept.gauge(v)
             directions = np.zeros((len(angles), plant.n))
             directions[:, plane] = np.column_stack([np.cos(angles), np.sin(angles)]) * plant.half_widths[list(plane)]
             for kind, reach in reaches.items():
@@ -111,15 +107,15 @@ def sections(out: Path = Path("safe-sets.png"), ids: Sequence[str] = IDS) -> Non
 def between_samples(ids: Sequence[str] = tuple(POINTS), points: int = 0, steps: int = 8000) -> None:
     """What it costs that the box counts between samples, too, for environments with a model in continuous time.
 
-    Each id has two lines: at sampling instants alone, and at all times. "S" and "P" are the shares of the safe box's
-    volume that ellipsoid and polytope fill, "rows" those of P, "s" the time of both searches and proofs, "bears" how
+    Each id has two lines: at sampling instants alone, and at all times. "share" is that of the safe box's volume which
+    the polytope P fills, "rows" are those of P, "s" is the time of search and proof, "bears" how
     much larger all disturbances and errors could be for some set ("tolerated_scale"). "overridden" and "reward"
     (per step) are those of an LQR behind the shield with P in mode "project", in the same episodes. "left" is the
     largest |c x| between two samples inside the box, without a shield, under random inputs of full size. "decision",
     "step" and "x 64" (steps of 64 environments) are times, least of many in turns, next to those of the first line.
     Where nothing certifies, the line says why.
     """
-    columns = ("N", "S", "P", "rows", "s", "bears", "overridden", "reward", "left", "decision", "step", "x 64")
+    columns = ("N", "share", "rows", "s", "bears", "overridden", "reward", "left", "decision", "step", "x 64")
     show = table("id", *columns, first=26, width=7)
     for name in ids:
         env = _env(name)
@@ -139,10 +135,9 @@ def between_samples(ids: Sequence[str] = tuple(POINTS), points: int = 0, steps: 
         works += [[_stepping(name, plant, number) for plant in plants] for number in (1, 64)]
         times = np.array([least_times(pair, blocks=200, repeats=10) for pair in works])
         for k, (plant, (certificate, seconds)) in enumerate(zip(plants, found, strict=True)):
-            recorded, rows = certificate.provenance, getattr(certificate.polytope, "rows", ())
-            shares = recorded["share_of_box"], recorded.get("polytope_share_of_box", np.nan)
+            recorded, rows = certificate.provenance, getattr(certificate.safe_set, "rows", ())
             overridden, reward = _behind(name, certificate, steps, plant=plant)
-            cells = [*(f"{share:.1%}" for share in shares), len(rows), f"{seconds:.1f}"]
+            cells = [f"{recorded['share_of_box']:.1%}", len(rows), f"{seconds:.1f}"]
             cells += [f"{recorded['tolerated_scale']:.2f}", f"{overridden:.1%}", f"{reward:.4f}"]
             cells += [f"{_left(name, plant, steps):.3f}", *(f"{ratio:.2f}" for ratio in times[:, k] / times[:, 0])]
             show(name, plant.between_samples or 1, *cells)

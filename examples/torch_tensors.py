@@ -28,7 +28,7 @@ def projected(actions: torch.Tensor, estimates: torch.Tensor) -> tuple[torch.Ten
     return torch.where(passes, actions, applied), passes
 
 
-estimates = torch.as_tensor(0.9 * shield.certificate.ellipsoid.sample(np.random.default_rng(0), 500))
+estimates = torch.as_tensor(0.9 * shield.certificate.safe_set.sample_boundary(np.random.default_rng(0), 500))
 policy = torch.nn.Linear(plant.n, plant.m, dtype=torch.float64)
 optimizer = torch.optim.Adam(policy.parameters(), lr=0.05)
 for step in range(101):

@@ -11,11 +11,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy._core._multiarray_umath import __cpu_features__
 
 from ncs_gym import ChannelContract, LinearPlant
 from shields import Certificate
 from shields.packaged_certificates import certificate_of_package
+from shields.polytope import Polytope
 from tests.product import synthesize
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -57,6 +59,12 @@ def certificate_of(
     return _certificates[key]
 
 
+def metric(certificate: Certificate) -> np.ndarray:
+    """M of the set x'Mx <= 1 that a certificate keeps, or of an ellipsoid like its polytope."""
+    S = certificate.safe_set
+    return S.F.T @ S.F if isinstance(S, Polytope) else np.linalg.inv(S.shape_matrix)
+
+
 def with_proof(certificate: Certificate, age: int = -1, **changes: Any) -> Certificate:
     """A certificate whose proof for an age of the newest sample, by default for the largest, has other fields."""
     proofs = list(certificate.proofs)
@@ -65,9 +73,9 @@ def with_proof(certificate: Certificate, age: int = -1, **changes: Any) -> Certi
 
 
 def _read_or_synthesized(plant: LinearPlant, contract: ChannelContract | None, safe_set: str) -> Certificate:
-    known = certificate_of_package(plant, contract) or _checked_in(plant, contract)
-    if known is not None and (safe_set == "polytope" or known.keeps_ellipsoid):
-        return known.without_polytope() if safe_set == "ellipsoid" else known
+    known = certificate_of_package(plant, contract, safe_set) or _checked_in(plant, contract, safe_set)
+    if known is not None:
+        return known
     name = _name_of(plant, contract, safe_set)
     if (file := CHECKED_IN / "others" / f"{name}.json").exists():
         return Certificate.load(file)
@@ -85,9 +93,10 @@ def _name_of(plant: LinearPlant, contract: ChannelContract | None, safe_set: str
     return hashlib.sha256(f"{plant.fingerprint} {contract} {safe_set}".encode()).hexdigest()[:16]
 
 
-def _checked_in(plant: LinearPlant, contract: ChannelContract | None) -> Certificate | None:
+def _checked_in(plant: LinearPlant, contract: ChannelContract | None, safe_set: str) -> Certificate | None:
     for file in CHECKED_IN.glob("*.json"):
-        if plant.fingerprint in file.read_text() and (certificate := Certificate.load(file)).contract == contract:
+        is_asked = (".ellipsoid" in file.name) == (safe_set == "ellipsoid") and plant.fingerprint in file.read_text()
+        if is_asked and (certificate := Certificate.load(file)).contract == contract:
             return certificate
     return None
 

@@ -97,7 +97,7 @@ VALUES = [
     PendulumProcess(),
     InvertedPendulumProcess(),
     CERTIFICATE,
-    CERTIFICATE.polytope,
+    CERTIFICATE.safe_set,
     CERTIFICATE.proofs[0],
     CERTIFICATE.updates,
     PaperCertificate(L=np.eye(2), K=np.ones((1, 2)), **PAPER),

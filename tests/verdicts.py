@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from scipy.linalg import expm
 
-from ncs_gym import LinearPlant
+from ncs_gym import Ellipsoid, LinearPlant
 from shields import Certificate, Report, paper, verify
 from shields.paper import PaperCertificate
 from tests.second_verifier.verify import verify_again
@@ -59,23 +59,24 @@ def assert_true(certificate: Certificate, plant: LinearPlant) -> None:
     assert_errors_stay(certificate, plant, a)
     D, K = plant.disturbance.shape_matrix, certificate.K
     closed, gain = plant.A + plant.B @ K, plant.B @ K
-    assert (np.linalg.eigvalsh(certificate.L) > 0.0).all()
-    sets = [(a, lambda rows: support(certificate.L, rows))] if certificate.keeps_ellipsoid else []
-    if certificate.polytope is not None:
-        faces = certificate.polytope.rows
-        corners = corners_of(faces)
-        sets.append((faces, lambda rows: np.abs(rows @ corners.T).max(axis=-1)))
-        assert certificate.keeps_ellipsoid or (support(certificate.L, faces) <= ROUNDING).all()
-    for rows, reach in sets:
-        errors = np.max([support(gain @ Sigma @ gain.T, rows) for Sigma in certificate.error_shapes], axis=0)
-        assert (reach(rows @ closed) + errors + support(D, rows) <= ROUNDING * reach(rows)).all()
-        assert (reach(plant.box_rows) <= ROUNDING).all()
-        used = np.max([support(Sigma, K) for Sigma in certificate.error_shapes], axis=0)
-        assert (reach(K) + used <= ROUNDING * plant.u_max).all()
-        for within in between(plant, 20 if certificate.between_samples else 0):
-            moved = within[:, : plant.n] + within[:, plant.n :] @ K
-            pushed = [support(Sigma, within[:, plant.n :] @ K) for Sigma in certificate.error_shapes]
-            assert (reach(moved) + np.max(pushed, axis=0) + support(D, plant.box_rows) <= ROUNDING).all()
+    S = certificate.safe_set
+    rows = a if isinstance(S, Ellipsoid) else S.rows
+
+    def reach(rows: np.ndarray) -> np.ndarray:
+        return (
+            support(S.shape_matrix, rows) if isinstance(S, Ellipsoid) else np.abs(rows @ corners_of(S.rows).T).max(-1)
+        )
+
+    assert (reach(a) > 0.0).all()
+    errors = np.max([support(gain @ Sigma @ gain.T, rows) for Sigma in certificate.error_shapes], axis=0)
+    assert (reach(rows @ closed) + errors + support(D, rows) <= ROUNDING * reach(rows)).all()
+    assert (reach(plant.box_rows) <= ROUNDING).all()
+    used = np.max([support(Sigma, K) for Sigma in certificate.error_shapes], axis=0)
+    assert (reach(K) + used <= ROUNDING * plant.u_max).all()
+    for within in between(plant, 20 if certificate.between_samples else 0):
+        moved = within[:, : plant.n] + within[:, plant.n :] @ K
+        pushed = [support(Sigma, within[:, plant.n :] @ K) for Sigma in certificate.error_shapes]
+        assert (reach(moved) + np.max(pushed, axis=0) + support(D, plant.box_rows) <= ROUNDING).all()
 
 
 def assert_errors_stay(certificate: Certificate, plant: LinearPlant, a: np.ndarray) -> None:

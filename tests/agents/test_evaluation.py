@@ -8,10 +8,10 @@ from gymnasium.vector import VectorWrapper
 
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
-from ncs_gym import Channel
+from ncs_gym import Channel, Ellipsoid
 from shields import certificate_for
 from shields.synthesis.polytope_certificates import with_polytope
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, metric
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 SHORT = CRUISE.with_kwargs(max_episode_steps=50)
@@ -47,7 +47,14 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
             return self.env.reset(seed=seed, options=options)
 
     monkeypatch.setattr(gym, "make_vec", lambda *given, **settings: Noting(make_vec(*given, **settings)))
-    played = evaluate(CRUISE, throttle, 8, 100, safe_set=certificate.M, on_progress=(reported := []).append)
+    played = evaluate(
+        CRUISE,
+        throttle,
+        8,
+        100,
+        safe_set=certificate.safe_set,
+        on_progress=(reported := []).append,
+    )
     assert sum(reported) == 8 * 200
     envs = make_vec(CRUISE.env, num_envs=8)
     plant = envs.unwrapped.plant
@@ -64,13 +71,19 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
         assert record.episode_return == pytest.approx(total[e])
         assert record.violation_steps == (np.abs(states[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum() > 0
         assert record.estimate_violation_steps == (np.abs(estimates[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum()
-        assert record.times_safe_set == pytest.approx(np.sqrt(max(x @ certificate.M @ x for x in states[:, e])))
+        assert record.times_safe_set == pytest.approx(np.sqrt(max(x @ metric(certificate) @ x for x in states[:, e])))
         assert not record.guaranteed
 
 
 def test_environments_without_a_vector_one_are_played_alike(scalar, shield):
     for loop in (scalar, LoopConfig(env=scalar.env, shield=shield)):
-        played = evaluate(loop.with_kwargs(max_episode_steps=60), throttle, 2, 0, shield.certificate.M)
+        played = evaluate(
+            loop.with_kwargs(max_episode_steps=60),
+            throttle,
+            2,
+            0,
+            shield.certificate.safe_set,
+        )
         shielded = loop.shield is not None
         assert [record.steps for record in played.episodes] == [60] * 2
         assert all((record.violation_steps == 0) == shielded for record in played.episodes)
@@ -80,7 +93,7 @@ def test_environments_without_a_vector_one_are_played_alike(scalar, shield):
 def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):
     penalized = replace(shield, penalty=1.0)
     free, other = (
-        evaluate(replace(SHORT, shield=each, violation_penalty=each.penalty), throttle, 3, 0, np.eye(2))
+        evaluate(replace(SHORT, shield=each, violation_penalty=each.penalty), throttle, 3, 0, Ellipsoid(np.eye(2)))
         for each in (shield, penalized)
     )
     assert free.episodes == other.episodes
@@ -108,8 +121,8 @@ def test_levels_are_those_of_the_set_that_the_shield_keeps(certificate, loaded):
     """The polytope is larger: states of it are outside the ellipsoid, and never count as outside of what is kept."""
     wide = with_polytope(certificate, loaded)
     loop = LoopConfig(env=CRUISE.env, shield=ShieldSettings(wide))
-    kept = evaluate(loop, throttle, 5, 0, wide.polytope).episodes
-    measured_by_the_ellipsoid = evaluate(loop, throttle, 5, 0, wide.M).episodes
+    kept = evaluate(loop, throttle, 5, 0, wide.safe_set).episodes
+    measured_by_the_ellipsoid = evaluate(loop, throttle, 5, 0, certificate.safe_set).episodes
     assert all(record.guaranteed and record.times_safe_set <= 1.0 for record in kept)
     assert max(record.times_safe_set for record in measured_by_the_ellipsoid) > 1.0
 
@@ -150,7 +163,7 @@ def test_more_episodes_than_are_played_side_by_side_are_played_in_parts():
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep", "Disabled"])
 def test_last_steps_of_episodes_count_whatever_the_autoreset(mode):
     usual, others = (
-        evaluate(CRUISE.with_kwargs(max_episode_steps=3, **more), throttle, 6, 0, np.eye(2))
+        evaluate(CRUISE.with_kwargs(max_episode_steps=3, **more), throttle, 6, 0, Ellipsoid(np.eye(2)))
         for more in ({}, {"autoreset_mode": mode})
     )
     assert sum(each.violation_steps for each in usual.episodes) > 3

@@ -20,7 +20,7 @@ import pytest
 
 import ncs_gym
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
-from tests.certificates import ROOT, certificate_of
+from tests.certificates import ROOT, certificate_of, metric
 from tests.product import altered, family_of, linear_plant, safety_filter
 
 on_x86 = pytest.mark.skipif(
@@ -146,7 +146,7 @@ def reordered(certificate, plant, order):
     return (
         replace(
             certificate,
-            L=certificate.L[square],
+            L=certificate.safe_set.shape_matrix[square],
             K=certificate.K[:, order],
             proofs=tuple(replace(proof, Sigma=proof.Sigma[square]) for proof in certificate.proofs),
             D=certificate.D[square],
@@ -165,14 +165,14 @@ def is_inside_exactly(certificate, plant, x_hat, shape, u):
     moved, D, L = (
         congruence(rational(plant.A), rational(shape)),
         rational(plant.disturbance.shape_matrix),
-        rational(certificate.L),
+        rational(certificate.safe_set.shape_matrix),
     )
     sizes = [
-        np.sqrt(np.trace(certificate.M @ part))
+        np.sqrt(np.trace(metric(certificate) @ part))
         for part in (plant.A @ shape @ plant.A.T, plant.disturbance.shape_matrix)
     ]
     nus = np.clip(sizes[0] / sum(sizes) + np.linspace(-0.02, 0.02, 9), 1e-9, 1.0 - 1e-9)
-    M, c = certificate.M, np.array([float(x) for x in center])
+    M, c = metric(certificate), np.array([float(x) for x in center])
     for nu in map(Fraction, nus.tolist()):
         total = add(scale(1 / nu, moved), scale(1 / (1 - nu), D))
         spread = np.linalg.eigvals(M @ np.array([[float(x) for x in row] for row in total])).real.max()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from flint import arb, arb_mat, ctx, fmpq
 
-from ncs_gym import LinearPlant
+from ncs_gym import Ellipsoid, LinearPlant
 from shields.certificate import Certificate
 from shields.verification.condition import Condition
 from tests.second_verifier.exact import (
@@ -36,7 +36,7 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
         return
     held = any(number(entry) != 0 for entry in plant.step_offset)
     yield is_so("between samples: no constant disturbance holds the operating point", not held)
-    (k, n), m, polytope = plant.box.shape, plant.m, certificate.polytope
+    (k, n), m, S = plant.box.shape, plant.m, certificate.safe_set
     kept = (grid.state.shape, grid.input.shape, grid.remainder.shape) == ((points, k, n), (points, k, m), (k,))
     if kept:
         first = np.concatenate([grid.state[0] - plant.box, grid.input[0]], axis=1)
@@ -51,7 +51,8 @@ def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator
         for j, least in enumerate(_remainders(plant, widths + [number(limit) for limit in plant.largest_input])):
             name = f"(G) what is between grid points is at most eta of row {j + 1}"
             yield ball_at_least_zero(name, arb(number(grid.remainder[j])) - least)
-        if polytope is None or len(polytope.multipliers) == len(polytope.rows) + m + k * points + len(plant.mixed_rows):
+        fits = isinstance(S, Ellipsoid) or len(S.multipliers) == len(S.rows) + m + k * points + len(plant.mixed_rows)
+        if fits:
             yield from _gain_conditions(certificate, plant)
 
 
@@ -88,14 +89,14 @@ def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
 
 
 def _gain_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (B), and (PB) if there is a polytope."""
-    grid, polytope, k = plant.grid_rows, certificate.polytope, len(plant.box)
+    """Checks (B) of an ellipsoid, (PB) of a polytope."""
+    grid, S, k = plant.grid_rows, certificate.safe_set, len(plant.box)
     assert grid is not None
-    L, K, D = matrix(certificate.L), matrix(certificate.K), matrix(certificate.D)
+    K, D = matrix(certificate.K), matrix(certificate.D)
     errors = [mapped(K, matrix(proof.Sigma)) for proof in certificate.proofs]
     rest = matrix(np.concatenate([certificate.resting_state, certificate.resting_input])).transpose()
     half = [number(each) for each in plant.input_half]
-    inside = None if polytope is None else Inside.of(polytope, k)
+    inside = None if isinstance(S, Ellipsoid) else Inside.of(S, k)
     for i, (state, pushed) in enumerate(zip(grid.state, grid.input, strict=True)):
         for j in range(k):
             push = matrix(pushed[j])
@@ -104,12 +105,12 @@ def _gain_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
             taken += arb(form(matrix(plant.box[j]), D)).sqrt()
             taken += arb(max(form(push, error) for error in errors)).sqrt()
             where = f"tau_{i} of row {j + 1}"
-            if certificate.keeps_ellipsoid:
-                name = f"(B) |c x| + rho <= 1 - eta on S at {where}"
-                yield ball_at_least_zero(name, 1 - taken - arb(form(image, L)).sqrt())
-            if polytope is not None and inside is not None:
+            if isinstance(S, Ellipsoid):
+                name, reached = f"(B) |c x| + rho <= 1 - eta on S at {where}", form(image, matrix(S.shape_matrix))
+                yield ball_at_least_zero(name, 1 - taken - arb(reached).sqrt())
+            elif inside is not None:
                 at_rest = (matrix(np.concatenate([state[j], pushed[j]])) * rest)[0, 0]
                 ends = [number(end[j]) - at_rest if np.isfinite(end[j]) else None for end in plant.box_ends]
-                which = len(polytope.rows) + plant.m + i * k + j
+                which = len(S.rows) + plant.m + i * k + j
                 left = inside.distance(image.tolist()[0], which, *ends) - taken
-                yield ball_at_least_zero(f"(PB) |c x| + rho <= 1 - eta on the polytope at {where}", left)
+                yield ball_at_least_zero(f"(PB) |c x| + rho <= 1 - eta on S at {where}", left)

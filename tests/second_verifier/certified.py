@@ -9,7 +9,7 @@ from typing import Any
 
 from flint import fmpq
 
-from ncs_gym import LinearPlant
+from ncs_gym import Ellipsoid, LinearPlant
 from shields.certificate import Certificate
 from shields.verification.condition import Condition
 from tests.second_verifier.between_samples import between_conditions
@@ -25,17 +25,18 @@ from tests.second_verifier.exact import (
     matrix,
     number,
 )
-from tests.second_verifier.polytope import Inside, polytope_conditions
+from tests.second_verifier.polytope import polytope_conditions
 
 
 def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks a certificate of method "certified"; what cannot be stated after something failed is left out."""
     fits = _fits(certificate, plant)
-    yield is_so("shapes: L (n, n), K (m, n), rows of a polytope (r, n), one input multiplier per input", fits)
+    yield is_so("shapes: K (m, n), gains of updates (n, p), one multiplier of an ellipsoid per input", fits)
     if not fits:
         return
     at_rest = [*certificate.resting_state.tolist(), *certificate.resting_input.tolist()]
-    if certificate.keeps_ellipsoid and (any(at_rest) or not plant.is_symmetric):
+    S = certificate.safe_set
+    if isinstance(S, Ellipsoid) and (any(at_rest) or not plant.is_symmetric):
         yield is_so("S: an ellipsoid is kept only around zero, within symmetric limits", False)
         return
     ranges = list(_range_conditions(certificate))
@@ -45,22 +46,21 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     D = matrix(certificate.D)
     yield from bound_conditions(certificate, plant)
     yield from _error_conditions(certificate, D, plant)
-    yield from _safe_set_conditions(certificate, D, plant)
-    if certificate.polytope is not None:
-        yield from polytope_conditions(certificate.polytope, certificate, plant)
+    if isinstance(S, Ellipsoid):
+        yield from _ellipsoid_conditions(S, certificate, D, plant)
+    else:
+        yield from polytope_conditions(S, certificate, plant)
     yield from between_conditions(certificate, plant)
 
 
 def _fits(certificate: Certificate, plant: LinearPlant) -> bool:
     """Returns whether all matrices and multipliers are as many and as large as the plant needs."""
     n, m, p, updates = plant.n, plant.m, plant.p, certificate.updates
-    shapes = [(certificate.L, (n, n)), (certificate.K, (m, n)), (certificate.D, (n, n))]
+    shapes = [(certificate.K, (m, n)), (certificate.D, (n, n))]
     for proof in certificate.proofs:
         shapes.append((proof.Sigma, (n, n)))
         if proof.shares is not None and proof.inputs is not None:
             shapes += [(proof.shares, (3,)), (proof.inputs, (m,))]
-    if certificate.polytope is not None:
-        shapes.append((certificate.polytope.rows, (len(certificate.polytope.rows), n)))
     if updates is None:
         count = 1
     else:
@@ -71,17 +71,17 @@ def _fits(certificate: Certificate, plant: LinearPlant) -> bool:
 
 def _range_conditions(certificate: Certificate) -> Iterator[Condition]:
     """Checks that every multiplier lies where the inequality that uses it is true."""
-    s = certificate.rounding
+    s = [] if certificate.rounding is None else [certificate.rounding]
     between = [] if certificate.updates is None else certificate.updates.shares.tolist()
     between += [proof.rate for proof in certificate.proofs]
     between += chain.from_iterable(proof.inputs.tolist() for proof in certificate.proofs if proof.inputs is not None)
     triples = [proof.shares.tolist() for proof in certificate.proofs if proof.shares is not None]
-    finite = all(math.isfinite(value) for value in chain(between, *triples, [s]))
+    finite = all(math.isfinite(value) for value in chain(between, *triples, s))
     yield is_so("multipliers: finite", finite)
     if not finite:
         return
     yield is_so("multipliers: 0 < lam_e < 1 and 0 < mu_i < 1", all(0 < number(value) < 1 for value in between))
-    yield is_so("multipliers: lx, le, ld, s > 0", all(number(value) > 0 for value in chain(*triples, [s])))
+    yield is_so("multipliers: lx, le, ld, s > 0", all(number(value) > 0 for value in chain(*triples, s)))
     least = min((1 - sum(map(number, triple), fmpq(0)) for triple in triples), default=fmpq(0))
     yield at_least_zero("multipliers: lx + le + ld <= 1", least)
 
@@ -114,17 +114,11 @@ def _error_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -> I
         yield _holds_next(name, sets[0], one - T * H, sets[age], mapped(T, N), mu)
 
 
-def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (S), and (I) and (U) for every error set; of an ellipsoid that is merely in the polytope only that."""
-    L, B = matrix(certificate.L), matrix(plant.B)
+def _ellipsoid_conditions(S: Ellipsoid, certificate: Certificate, D: Any, plant: LinearPlant) -> Iterator[Condition]:
+    """Checks (S), and (I) and (U) for every error set."""
+    L, B = matrix(S.shape_matrix), matrix(plant.B)
     K_rows = [matrix(row) for row in certificate.K]
     yield definite("L > 0", L, strictly=True)
-    if certificate.polytope is not None and not certificate.keeps_ellipsoid:
-        inside = Inside.of(certificate.polytope, len(plant.box))
-        for i, row in enumerate(certificate.polytope.rows if inside else ()):
-            nearest = min(abs(end) for end in inside.ends[i] if end is not None)
-            yield at_least_zero(f"(L) g L g' <= 1 of row {i + 1}", nearest * nearest - form(matrix(row), L))
-        return
     for j, row in enumerate(plant.box_rows):
         yield at_least_zero(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - form(matrix(row), L))
     BK, s = B * matrix(certificate.K), number(certificate.rounding)
@@ -136,7 +130,7 @@ def _safe_set_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -
         rounding += plant.m * (FLOAT32 * number(limit)) ** 2 * (column.transpose() * column)
     D_u = (1 + s) * (s * D + rounding)
     for age, proof in enumerate(certificate.proofs):
-        assert proof.shares is not None  # `keeps_ellipsoid`
+        assert proof.shares is not None
         assert proof.inputs is not None
         label = "" if certificate.updates is None else f" at age {age}"
         Sigma, (lx, le, ld) = matrix(proof.Sigma), map(number, proof.shares)

@@ -46,8 +46,7 @@ def certified(name, kind):
     elif name[0].isupper():
         env = gym.make(f"ncs_gym/{name}-v0").unwrapped
         plant, contract = env.plant, env.certificate_contract
-        certificate = certificate_for(plant, contract)
-        return plant, certificate if kind == "polytope" else certificate.without_polytope()
+        return plant, certificate_for(plant, contract, kind)
     else:
         plant, contract = named(name)
     return plant, certificate_of(plant, contract, kind)
@@ -110,7 +109,7 @@ def equilibria_at(directions, state, value, rng):
 def test_range_is_that_of_a_linear_program_in_states_and_inputs(name):
     """With states and inputs as variables, the limits of the test, and errors and disturbances by their supports."""
     plant, certificate = certified(name, "polytope")
-    P, within, D = certificate.polytope, rows_within_step(plant), plant.disturbance.shape_matrix
+    P, within, D = certificate.safe_set, rows_within_step(plant), plant.disturbance.shape_matrix
     for age in ages_of(certificate):
         Sigma = certificate.error_shapes[age]
         rows = np.vstack([np.hstack([P.rows @ plant.A, P.rows @ plant.B]), np.hstack([within.state, within.input])])
@@ -170,9 +169,9 @@ def test_no_point_of_the_set_is_beyond_its_reach_and_some_point_attains_it(name,
             assert values.max() <= percent * (1.0 + 1e-9) <= 100.0 + 1e-6
             along = row * np.sign(end)
             if kind == "ellipsoid":
-                farthest = certificate.ellipsoid.extreme_point(along)
+                farthest = certificate.safe_set.extreme_point(along)
             else:
-                faces, center = certificate.polytope.F, certificate.resting_state
+                faces, center = certificate.safe_set.F, certificate.resting_state
                 scale = 1.0 / np.abs(faces).max(axis=0)
                 found = linprog(-along * scale, A_ub=faces * scale, b_ub=np.ones(len(faces)), bounds=(None, None))
                 farthest = center + scale * found.x

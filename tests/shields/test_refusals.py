@@ -9,12 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ncs_gym import truck_trailer
+from ncs_gym import Ellipsoid, truck_trailer
 from shields import Certificate, CertificateError, Infeasible, requirements, verify
 from shields.certificate import Proof
 from shields.documents import document_of
 from shields.paper.synthesis import kappa_rho_grid
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, with_proof
 from tests.plants import named, servo
 from tests.product import altered, library_plant, linear_plant, paper_synthesis, synthesize
 
@@ -36,22 +36,16 @@ def synthesized(box, gamma=1e-4, A=((0.9, 0.2), (0, 0.8))):
     return synthesize(linear_plant(A=A, B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
 
 
-def with_proofs(name, **changes):
-    """The certificate with other fields in its last proof."""
-    *others, last = kept(name, "polytope").proofs
-    return replace(kept(name, "polytope"), proofs=(*others, replace(last, **changes)))
-
-
 def read(**changes):
     """A certificate read from a document with other entries, whose checksum fits."""
     content = json.loads(json.dumps(kept("stable", "polytope").document["certificate"]))
-    return Certificate.read(document_of("certificate", "ncs-gym certificate 3", content | changes))
+    return Certificate.read(document_of("certificate", "ncs-gym certificate 4", content | changes))
 
 
 def read_multipliers(first):
     """A certificate read from a document with other multipliers of the first row of its polytope."""
-    polytope = kept("stable", "polytope").document["certificate"]["polytope"]
-    return read(polytope=polytope | {"multipliers": [first, *polytope["multipliers"][1:]]})
+    polytope = kept("stable", "polytope").document["certificate"]["safe_set"]
+    return read(safe_set=polytope | {"multipliers": [first, *polytope["multipliers"][1:]]})
 
 
 REFUSED = [
@@ -102,22 +96,28 @@ REFUSED = [
     (lambda: replace(kept("unstable"), proofs=kept("unstable").proofs[:1]), CertificateError, "must have 2 proofs"),
     (lambda: replace(kept(), between_samples="8"), CertificateError, "between_samples must be"),
     (
-        lambda: replace(kept("servo", "polytope"), polytope=None),
+        lambda: replace(kept("servo", "polytope"), safe_set=Ellipsoid(np.eye(2))),
         CertificateError,
-        r"no multipliers of \(I\), and it has no polytope",
+        r"multipliers of \(I\) and of rounding belong to an ellipsoid",
     ),
-    (lambda: with_proofs("servo", **SHARES), CertificateError, "either all of its proofs"),
+    (
+        lambda: with_proof(kept("servo", "polytope"), **SHARES),
+        CertificateError,
+        "belong to an ellipsoid, which needs all of them",
+    ),
+    (lambda: replace(kept(), rounding=None), CertificateError, "belong to an ellipsoid, which needs all of them"),
+    (lambda: replace(kept(), safe_set="S"), CertificateError, "its safe set must be an Ellipsoid or a Polytope"),
+    (lambda: replace(kept(), resting_state=[0.1, 0.0]), CertificateError, "must be around its resting state"),
     (lambda: Proof(Sigma=np.eye(2), rate=0.5, shares=SHARES["shares"]), CertificateError, "both be given, or neither"),
-    (lambda: with_proofs("stable", rate="x"), CertificateError, "rate of an error set must be numbers"),
-    (lambda: with_proofs("stable", inputs=0.5), CertificateError, r"multipliers of \(U\) must be numbers"),
-    (lambda: with_proofs("stable", inputs=None), CertificateError, "both be given, or neither"),
-    (lambda: with_proofs("stable", shares=[None, 0.1, 0.1]), CertificateError, r"multipliers of \(I\) must be numbers"),
+    (lambda: with_proof(kept(), rate="x"), CertificateError, "rate of an error set must be numbers"),
+    (lambda: with_proof(kept(), inputs=0.5), CertificateError, r"multipliers of \(U\) must be numbers"),
+    (lambda: with_proof(kept(), inputs=None), CertificateError, "both be given, or neither"),
+    (lambda: with_proof(kept(), shares=[None, 0.1, 0.1]), CertificateError, r"multipliers of \(I\) must be numbers"),
     # Files whose checksum fits.
-    (lambda: read(L=[[float("nan"), 0.0], [0.0, 1.0]]), CertificateError, "certificate"),
+    (lambda: read(safe_set={"L": [[float("nan"), 0.0], [0.0, 1.0]]}), CertificateError, "certificate"),
     (lambda: read(K="no"), CertificateError, "certificate"),
-    (lambda: read(Sigma=[[1.0]]), CertificateError, "certificate"),
-    (lambda: read(multipliers={}), CertificateError, "certificate"),
-    (lambda: read(multipliers=3), CertificateError, "certificate"),
+    (lambda: read(errors={}), CertificateError, "certificate"),
+    (lambda: read(errors=3), CertificateError, "certificate"),
     *(
         (lambda entry=entry: read_multipliers(entry), CertificateError, "certificate")
         for entry in (
@@ -126,8 +126,8 @@ REFUSED = [
         )
     ),
     # Too many rows are refused before they take memory.
-    (lambda: read(polytope={"rows": [[]] * 200_000, "multipliers": [[]] * 200_000}), CertificateError, "certificate"),
-    (lambda: read(polytope={"rows": [[1.0]] * 500, "multipliers": [[]] * 501}), CertificateError, "certificate"),
+    (lambda: read(safe_set={"rows": [[]] * 200_000, "multipliers": [[]] * 200_000}), CertificateError, "certificate"),
+    (lambda: read(safe_set={"rows": [[1.0]] * 500, "multipliers": [[]] * 501}), CertificateError, "certificate"),
     # Formulas of the paper.
     *(
         (lambda steps=steps: next(kappa_rho_grid(*steps)), ValueError, "must be a number > 0")

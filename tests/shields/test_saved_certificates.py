@@ -18,7 +18,8 @@ def with_polytope(certificate, rows, multipliers, seed=0):
     values = np.zeros((multipliers, rows))
     values[rng.integers(multipliers, size=50), rng.integers(rows, size=50)] = rng.standard_normal(50)
     polytope = Polytope(rows=rng.standard_normal((rows, 2)), multipliers=values)
-    return replace(certificate, polytope=polytope)
+    proofs = [replace(each, shares=None, inputs=None) for each in certificate.proofs]
+    return replace(certificate, safe_set=polytope, proofs=proofs, rounding=None)
 
 
 @settings(max_examples=30, deadline=None)

@@ -81,7 +81,7 @@ def extremes(plant, certificate, age, steps, share=None):
     values = np.concatenate([plant.box @ x, u])
     constant = values[:, 0]
     linear = values[:, 1:] - constant[:, None]
-    P, rest = certificate.polytope, certificate.resting_state
+    P, rest = certificate.safe_set, certificate.resting_state
     roots = [certificate.Sigma] + [plant.disturbance.shape_matrix] * (age + steps)
     least, largest = [], []
     for row, offset in zip(linear, constant, strict=True):
@@ -144,10 +144,8 @@ def test_a_resting_point_that_is_no_equilibrium_moves_the_estimate():
     moved = replace(
         found,
         fingerprint=plant.fingerprint,
-        proofs=tuple(replace(proof, shares=None, inputs=None) for proof in found.proofs),
         resting_state=x_c,
-        polytope=replace(found.polytope, center=x_c),
-        L=1e-4 * found.L,
+        safe_set=replace(found.safe_set, center=x_c),
     )
     steps = shields.silence_of(moved, plant).at_rest
     for each in (1, steps // 2, steps):
@@ -159,7 +157,8 @@ def test_box_is_kept_in_silence_whatever_an_agent_does():
     plant, certificate, found = registered("drifts")
     h = certificate.contract.max_age
     assert found.anywhere > 10
-    assert shields.silence_of(certificate.without_polytope(), plant).anywhere >= found.anywhere
+    ellipsoid = certificate_for(plant, certificate.contract, "ellipsoid")
+    assert shields.silence_of(ellipsoid, plant).anywhere >= found.anywhere
     trace = [0 if k % (h + 1) == 0 else -1 for k in range(HEARD)] + [-1] * 200
     settings = {"disturbance": "adversarial", "terminate_on_violation": False, "max_episode_steps": 1000}
     env = vector_env(

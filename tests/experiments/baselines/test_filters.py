@@ -11,7 +11,8 @@ from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines.controllers import controller
 from experiments.baselines.filters import FILTERS, CertaintyEquivalentFilter, EstimateFilterSettings, PredictiveFilter
 from ncs_gym.envs.env import ncs_env
-from tests.certificates import certificate_of
+from shields.polytope import Polytope
+from tests.certificates import certificate_of, metric
 from tests.plants import delayed
 from tests.product import safety_filter, synthesize
 from tests.shields.polytope.limits import PLANTS
@@ -38,7 +39,7 @@ def played(certificate, **filters):
     """The regulator on the cruise, always with the same seed."""
     loop = LoopConfig(env=CRUISE, **filters)
     policy = controller("lqr", ncs_env(loop.single()), certificate.fallback, 0)
-    return evaluate(loop, policy, 20, 7, certificate.M).episodes
+    return evaluate(loop, policy, 20, 7, certificate.safe_set).episodes
 
 
 def test_trusting_filter_is_caught_leaving_the_safe_set_and_the_shield_is_not(certificate):
@@ -81,13 +82,13 @@ def test_margin_is_of_what_states_are_off_by_and_not_of_past_inputs():
     plant = delayed(2)
     certificate, rng, angles = certificate_of(plant), np.random.default_rng(0), np.arange(0.0, 7.0, 0.05)
     estimates = rng.uniform(0.5, 1.0, (400, 1)) * certificate.safe_set.sample_boundary(rng, 400)
-    off = np.linalg.cholesky(certificate.L[:2, :2]) @ [np.cos(angles), np.sin(angles)]
+    off = np.linalg.cholesky(np.linalg.inv(plant.weight)[:2, :2]) @ [np.cos(angles), np.sin(angles)]
     off = 0.1 * np.vstack([off, np.zeros((2, len(angles)))])
 
     def level(u):
         """The largest x'Mx of the next state, with the margin around it, of each estimate."""
         places = (plant.A @ estimates.T + plant.B @ u.T)[:, :, None] + off[:, None]
-        return np.einsum("isk,ij,jsk->sk", places, certificate.M, places).max(axis=1)
+        return np.einsum("isk,ij,jsk->sk", places, metric(certificate), places).max(axis=1)
 
     bearable = np.min([level(np.full((400, 1), u)) for u in np.linspace(-0.8, 0.8, 41)], axis=0) < 0.98
     largest = {}
@@ -123,7 +124,7 @@ def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(kind, cer
     plant = loaded
     if kind == "polytope":
         certificate = synthesize(loaded, contract=certificate.contract)
-        assert certificate.polytope is not None
+        assert isinstance(certificate.safe_set, Polytope)
     elif kind == "two ends":
         plant, certificate = PLANTS["angle"], limited("angle")
     predictive, grid = PredictiveFilter(certificate, plant, horizon=2), np.linspace(*plant.input_ends[:, 0], 401)
@@ -209,7 +210,7 @@ def test_what_is_not_changed_is_passed_on_bit_for_bit_and_a_reset_counts_nothing
     envs = EstimateFilterSettings("trusting", certificate, 2.0)(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
     free = EstimateFilterSettings("trusting", certificate)(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
     for each in (envs, free):
-        each.reset(seed=1, options={"state": 0.95 * np.linalg.cholesky(certificate.L)[:, 0]})
+        each.reset(seed=1, options={"state": 0.95 * np.linalg.cholesky(certificate.safe_set.shape_matrix)[:, 0]})
     overridden = 0
     for k in range(4):
         actions = np.full((2, 1), 1.0 if k < 3 else -1.0)

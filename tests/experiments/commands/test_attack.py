@@ -141,7 +141,7 @@ def test_agents_are_random_outward_turned_round_and_bang_bang():
     first, second = act(estimates).copy(), act(estimates)
     assert (first[:2] != second[:2]).all()
     np.testing.assert_array_equal(first[2:], second[2:])
-    growing = np.array([x @ plant.A.T @ certificate.M @ plant.B for x in estimates])
+    growing = np.array([x @ plant.A.T @ plant.weight @ plant.B for x in estimates])
     np.testing.assert_array_equal(first[2:4], np.sign(growing[2:4]))
     np.testing.assert_array_equal(np.sign(first[4:6]), -np.sign(estimates[4:6] @ certificate.K.T))
     np.testing.assert_array_equal(np.abs(first[6:]), 1.0)

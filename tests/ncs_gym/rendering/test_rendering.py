@@ -159,7 +159,7 @@ def test_plane_shows_safe_set_error_plan_path_and_interventions_in_their_sizes_a
 
 def test_outline_of_a_set_is_around_its_projection_and_touches_it():
     shield = safety_shield(gym.make("ncs_gym/CartPole-v0"))
-    plant, polytope = shield.unwrapped.plant, shield.certificate.polytope
+    plant, polytope = shield.unwrapped.plant, shield.certificate.safe_set
     corners = PhasePlane(plant)._outline(polytope)
     directions = np.zeros((8, 4))
     directions[:, [2, 3]] = np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from shields import SafetyFilter
+from shields.polytope import Polytope
 from shields.runtime import safety_filter
 from shields.runtime.backup_plans import plan_check
 from shields.runtime.guarantee import OLD_SAMPLE
@@ -166,10 +167,9 @@ def errors_forgotten(patch):
 @contextmanager
 def set_enlarged(patch, of, factor=1.5):
     """A certificate of a larger set, which nobody verifies; episodes start where they would in the right one."""
-    right, scaled = of.certificate, None
-    if right.polytope is not None:
-        scaled = replace(right.polytope, rows=right.polytope.rows / factor)
-    wrong = replace(right, L=factor**2 * right.L, polytope=scaled)
+    S = of.certificate.safe_set
+    larger = {"rows": S.rows / factor} if isinstance(S, Polytope) else {"shape_matrix": factor**2 * S.shape_matrix}
+    wrong = replace(of.certificate, safe_set=replace(S, **larger))
     for check in ("require_valid", "require_computable"):
         patch.setattr(safety_filter, check, lambda *_: None)
     yield {"of": replace(of, claimed=wrong, start=of.start / factor)}

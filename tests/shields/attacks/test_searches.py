@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import differential_evolution
 
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, metric
 from tests.product import safety_filter
 from tests.shields.attacks.cases import RANDOM, TRUCKS
 from tests.shields.edges import gained
@@ -31,7 +31,7 @@ def test_no_search_over_state_error_disturbance_and_proposal_leaves_the_safe_set
         errors = shield.errors_of_many(size[:, None, None] ** 2 * certificate.Sigma)
         u = shield.decide_columns(x + size * e, errors, plant.u_max[:, None] * numbers[3 * n : -1]).input
         reached = plant.A @ x + plant.B @ u + d
-        return -np.sqrt(np.einsum("ik,ij,jk->k", reached, certificate.M, reached))
+        return -np.sqrt(np.einsum("ik,ij,jk->k", reached, metric(certificate), reached))
 
     bounds = [(-1.0, 1.0)] * (3 * n + plant.m) + [(1e-3, 1.0)]
     settings = {"maxiter": generations, "popsize": 8, "rng": 0, "polish": False, "tol": 0.0}
@@ -47,9 +47,13 @@ def test_no_ascent_over_state_error_and_disturbance_leaves_the_safe_set_under_th
     certificate = certificate_of(plant)
     shield, rng = safety_filter(certificate, plant), np.random.default_rng(0)
     closed, gain = plant.A + plant.B @ certificate.K, plant.B @ certificate.K
-    safe, errors, M = certificate.safe_set, certificate.error_set, certificate.M
+    safe, errors, M = certificate.safe_set, certificate.error_set, metric(certificate)
     lx, le, ld = certificate.proofs[-1].shares
-    reach = closed @ certificate.L @ closed.T / lx + gain @ certificate.Sigma @ gain.T / le + certificate.D / ld
+    reach = (
+        closed @ certificate.safe_set.shape_matrix @ closed.T / lx
+        + gain @ certificate.Sigma @ gain.T / le
+        + certificate.D / ld
+    )
     worst, bound = 0.0, np.sqrt(np.linalg.eigvals(M @ reach).real.max())
     for _ in range(60):
         slope = rng.standard_normal(plant.n)

@@ -180,7 +180,7 @@ class SeenEnv(NCSEnv):
 def starts_of(case: Case, mode: str, rng: np.random.Generator, count: int) -> np.ndarray:
     """States on the boundary of the safe set, or of a part of it; in mode "lookahead" all over the box, (n, count)."""
     plant, safe = case.plant, region_of(case.certificate.safe_set)
-    scale = plant.half_widths if hasattr(safe, "rows") else np.sqrt(np.diag(case.certificate.L))
+    scale = plant.half_widths if hasattr(safe, "rows") else np.sqrt(np.diag(case.certificate.safe_set.shape_matrix))
     starts = case.start * boundary(safe, scale, rng, count)
     if mode != "lookahead":
         return starts
@@ -202,11 +202,21 @@ def planning(case: Case, mode: str) -> dict[str, Any]:
     return {"mode": mode, "horizon": case.horizon if mode == "lookahead" else None}
 
 
+def shape_inside(certificate: Certificate, plant: LinearPlant) -> np.ndarray:
+    """The shape of an ellipsoid around the operating point that lies in the safe set, (n, n)."""
+    S = certificate.safe_set
+    if isinstance(S, Ellipsoid):
+        return S.shape_matrix
+    box = np.linalg.inv(plant.weight)
+    return ((1.0 + S.F @ S.center) / Ellipsoid(box).support(S.F)).min() ** 2 * box
+
+
 def through_shield(case: Case, mode: str, network: int, count: int | None, steps: int, seed: int) -> Outcome:
     """Attacks `SafetyShield`, or with a count `VectorSafetyShield`, around environments."""
     rng, (uplink, downlink) = np.random.default_rng(seed), case.networks[network % len(case.networks)]
     plant, certificate, nature, many = case.plant, case.certificate, Nature(), count is not None
-    first = box_ellipsoid(plant, 0.6) if mode == "lookahead" else Ellipsoid((0.999 * case.start) ** 2 * certificate.L)
+    scale = (0.999 * case.start) ** 2
+    first = box_ellipsoid(plant, 0.6) if mode == "lookahead" else Ellipsoid(scale * shape_inside(certificate, plant))
     settings: dict[str, Any] = {
         "plant": plant,
         "channel": uplink,

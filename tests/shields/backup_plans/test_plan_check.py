@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid
+from shields.polytope import Polytope
 from shields.runtime.backup_plans import PlanTest, Prediction, plan_check
 from shields.runtime.backup_plans.plan_check import Tightening
 from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.set_test import SMALLEST_RADIUS, ellipsoid_test
 from shields.verification.rational_matrix import multiply, quadratic, rational
+from tests.certificates import metric
 from tests.product import linear_plant, safety_filter
 from tests.shields.attacks.adversary import farthest
 from tests.shields.attacks.cases import case as attacked_case
@@ -81,7 +83,7 @@ def test_what_may_not_begin_a_plan_begins_none_of_many(case):
     may = test.may_begin(estimates, tightening, plans[:, 0, 0])
     assert certified[may].any()
     assert not certified[~may].any()
-    assert may.all() == (certificate.polytope is None)  # there the end, S, is not looked at
+    assert may.all() == (isinstance(certificate.safe_set, Ellipsoid))  # there the end, S, is not looked at
     assert not test.may_begin(np.full_like(estimates, np.nan), tightening, plans[:, 0, 0]).any() or may.all()
 
 
@@ -116,13 +118,13 @@ def test_tightenings_between_samples_are_what_extreme_errors_and_disturbances_at
 
 def largest_level(plant, certificate, x_hat, shape, plan, step, rng):
     """Largest |x_{step+1}|_M found by ascent over error and disturbances, from many starts; of a polytope exactly."""
-    if certificate.polytope is not None:
-        ends = extreme_ends(plant, x_hat, shape, plan, certificate.polytope.F, step)
+    if isinstance(certificate.safe_set, Polytope):
+        ends = extreme_ends(plant, x_hat, shape, plan, certificate.safe_set.F, step)
     else:
         directions = rng.standard_normal((4, plant.n))
         for _ in range(15):
             ends = extreme_ends(plant, x_hat, shape, plan, directions, step)
-            directions = ends @ certificate.M
+            directions = ends @ metric(certificate)
     return certificate.safe_set.gauge(ends).max()
 
 
@@ -148,7 +150,7 @@ def test_plans_are_certified_if_every_possible_state_stays_in_the_box_and_ends_i
                 lengths += step > 0
             elif not outside:
                 # the exact containment in S is sharper than the test, though not by much; in P the test is exact
-                assert level > (0.6 if certificate.polytope is None else 1.0 - 1e-6)
+                assert level > (0.6 if isinstance(certificate.safe_set, Ellipsoid) else 1.0 - 1e-6)
                 refused += 1
             outside |= bool(farthest_out_of_box(plant, x_hat, shape, plan, step) > 1.0 + 1e-8)
     assert refused > 5
@@ -265,10 +267,11 @@ def test_plans_are_certified_in_rational_arithmetic_where_powers_cancel(where, s
 
 @pytest.mark.parametrize("scale", [0.5, 1.0])
 def test_nothing_is_certified_where_the_radius_is_too_small_for_the_weights(case, scale):
-    plant, certificate, _ = case
-    test = PlanTest(Prediction(ellipsoid_test(certificate.L, plant), 1), 0.0)
+    plant = case[0]
+    L = np.linalg.inv(plant.weight)
+    test = PlanTest(Prediction(ellipsoid_test(L, plant), 1), 0.0)
     nothing, plan = np.zeros((1, plant.n)), np.zeros((1, 1, 1, plant.m))
-    shape = scale * certificate.L[None]
+    shape = scale * L[None]
     size = edge_of(lambda s: test.certified(nothing, test.tightenings_of(s * shape), plan)[0, 0, 0], 1e3)
     assert SMALLEST_RADIUS <= test.tightenings_of(size * shape).radius.item() < 1.01 * SMALLEST_RADIUS
 

@@ -12,6 +12,7 @@ from ncs_gym import Ellipsoid
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import SafetyFilter
 from shields.runtime.backup_plans import plan_search
+from tests.certificates import metric
 from tests.product import safety_filter
 from tests.shields.attacks.cases import case
 from tests.shields.runtime.batches import decided_alike
@@ -37,7 +38,7 @@ def best_distance(shield, x_hat, shape, proposed, length):
 
     The same sets by another route: ellipsoids summed pair by pair, weights from the eigenvalues.
     """
-    plant, M = shield.plant, shield.certificate.M
+    plant, M = shield.plant, metric(shield.certificate)
     root = np.linalg.cholesky(M).T
     u = cp.Variable((length, plant.m))
     constraints, center, power, disturbed = (

@@ -96,7 +96,7 @@ def test_a_projected_input_leaves_nothing_of_an_earlier_plan(monkeypatch):
 
     monkeypatch.setattr(shield.lookahead.planner, "find", nothing_found)
     rng, shape, stored = np.random.default_rng(0), shield.certificate.error_shapes[0], np.zeros((2, plant.m))
-    kept, reach = 0, np.sqrt(np.diag(shield.certificate.L))
+    kept, reach = 0, np.sqrt(np.diag(shield.certificate.safe_set.shape_matrix))
     for _ in range(100):
         x_hat, u = reach * rng.uniform(-1.0, 1.0, plant.n), plant.u_max * rng.choice([-1.0, 1.0], plant.m)
         errors, padded = shield.errors_of(shape).batch(), shield.lookahead.as_stored(stored)[..., None]

@@ -26,7 +26,7 @@ from shields.verification.rational_matrix import (
     subtract,
     transpose,
 )
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, metric
 from tests.product import (
     belief,
     linear_plant,
@@ -50,7 +50,7 @@ UNSTABLE = behind(cart_pole(), (Channel(loss=0.3, delay=1, max_consecutive_losse
 
 def shielded(mode="project", start=0.3, kind=loop_env, **settings):
     certificate = certificate_of(PLANT)
-    usual = {"downlink": KEPT, "initial_set": Ellipsoid(start**2 * certificate.L)}
+    usual = {"downlink": KEPT, "initial_set": Ellipsoid(start**2 * certificate.safe_set.shape_matrix)}
     env = kind(PLANT, UPLINK, **(usual | settings))
     return safety_shield(env, certificate, mode=mode)
 
@@ -63,7 +63,7 @@ def levels(shield, info):
 def test_a_guarantee_that_is_regained_is_one_about_the_present_and_every_step_until_the_next_input(input_delay, size):
     shield = shielded(downlink=Channel(delay=input_delay), disturbance="sphere", start=1e-3)
     # Outside S, drifting back in: an estimate is that of c steps later.
-    start = size * np.array([1.0, 0.0]) / np.sqrt(shield.certificate.M[0, 0])
+    start = size * np.array([1.0, 0.0]) / np.sqrt(metric(shield.certificate)[0, 0])
     _, info = shield.reset(seed=0, options={"state": start})
     inside, guaranteed = [each.in_safe_set for each in starts_known(shield.filter, start, input_delay)], []
     for step in range(30):
@@ -78,7 +78,7 @@ def test_a_guarantee_that_is_regained_is_one_about_the_present_and_every_step_un
 
 def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
     shield, input_delay = shielded().filter, 3
-    small, large = (Ellipsoid(scale**2 * shield.certificate.L) for scale in (0.3, 0.999999))
+    small, large = (Ellipsoid(scale**2 * shield.certificate.safe_set.shape_matrix) for scale in (0.3, 0.999999))
     assert all(known.in_safe_set for known in starts_known(shield, small, input_delay))
     known = starts_known(shield, large, input_delay)
     assert known[0].in_safe_set
@@ -97,7 +97,11 @@ def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
 
 def test_a_given_start_is_followed_under_zero_input():
     plant, certificate, input_delay, rng = UNSTABLE.plant, UNSTABLE.certificate, 3, np.random.default_rng(0)
-    shield, safe, root = safety_filter(certificate, plant), certificate.safe_set, np.linalg.cholesky(certificate.M).T
+    shield, safe, root = (
+        safety_filter(certificate, plant),
+        certificate.safe_set,
+        np.linalg.cholesky(metric(certificate)).T,
+    )
     powers = [np.linalg.matrix_power(plant.A, k) for k in range(input_delay + 1)]
     spread = [np.linalg.norm(root @ power @ np.linalg.cholesky(plant.disturbance.shape_matrix), 2) for power in powers]
     entered = left = 0
@@ -122,7 +126,7 @@ def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_d
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
     plant = linear_plant(A=[[0.5, -0.3], [0.25, -0.15]], B=np.ones((2, 1)), box=np.eye(2), **settings)
     certificate, rng, known = certificate_of(plant), np.random.default_rng(0), 0
-    shield, M = safety_filter(certificate, plant), rational(certificate.M)
+    shield, M = safety_filter(certificate, plant), rational(metric(certificate))
     *_, axes = np.linalg.svd(plant.A)
     for _ in range(count):
         base = axes[1] * size * rng.uniform(0.5, 1.0)
@@ -141,7 +145,7 @@ def test_starts_along_a_line_that_moves_into_the_safe_set_are_known_to_only_if_t
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
     plant = linear_plant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
     certificate, rng = certificate_of(plant), np.random.default_rng(0)
-    shield, A, L = safety_filter(certificate, plant), rational(plant.A), rational(certificate.L)
+    shield, A, L = safety_filter(certificate, plant), rational(plant.A), rational(certificate.safe_set.shape_matrix)
     for _ in range(count):
         long = (size * rng.uniform(0.5, 1.0)) ** 2 * np.array([[1.0, 2.0], [2.0, 4.0]])  # which A annihilates
         width = edge_of(lambda x, long=long: starts_known(shield, Ellipsoid(long + x * THIN), 1)[1].in_safe_set, 16.0)
@@ -224,7 +228,7 @@ class Meddler:
 @pytest.mark.parametrize(("key", "reason"), [("committed", OTHER_INPUT), ("applied", LATE_INPUT)])
 def test_other_inputs_than_decided_end_the_guarantee(key, reason):
     certificate = certificate_of(PLANT)
-    inner = loop_env(PLANT, UPLINK, initial_set=Ellipsoid(0.09 * certificate.L), downlink=KEPT)
+    inner = loop_env(PLANT, UPLINK, initial_set=Ellipsoid(0.09 * certificate.safe_set.shape_matrix), downlink=KEPT)
     meddler, shield = Meddler(inner, key), safety_shield(inner, certificate)
     shield.reset(seed=0)
     for _ in range(5):
@@ -294,7 +298,7 @@ def test_safe_loop_speaks_the_protocol(downlink):
     loop = safe_loop(certificate, PLANT, UPLINK, downlink=downlink)
     actuator = Actuator(loop.input_delay, PLANT.m)
     up, down = ChannelState(UPLINK, rng), ChannelState(downlink, rng)
-    state = 0.2 * Ellipsoid(certificate.L).sample_boundary(rng)
+    state = 0.2 * Ellipsoid(certificate.safe_set.shape_matrix).sample_boundary(rng)
     loop.start(state + PLANT.of_first_error.drawn(rng))
     actuator.start(loop.episode)
     packets, applied, scheduled, worst = [], None, [np.zeros(1)] * loop.input_delay, 0.0

@@ -13,7 +13,7 @@ import pytest
 from ncs_gym import Channel
 from shields import Certificate, CertificateError
 from shields.export import BoardFilter, BoardTable, board_filter, c_files, export_c
-from tests.certificates import CHECKED_IN
+from tests.certificates import CHECKED_IN, certificate_of
 from tests.command import ncs, succeeded
 from tests.plants import oscillator
 from tests.product import safety_filter
@@ -59,7 +59,7 @@ class Ends(Faces):
 
 
 def set_of(certificate):
-    P = certificate.polytope
+    P = certificate.safe_set
     return Ends.of(P.rows, P.low, P.high)
 
 
@@ -297,7 +297,7 @@ def test_ellipsoids_and_limits_within_a_step_are_refused():
     plant, certificate = example("CSTR")
     within, between = example("coupled"), oscillator()
     given = {
-        "it has no polytope": (certificate.without_polytope(), plant),
+        "it has no polytope": (certificate_of(plant, certificate.contract), plant),
         "its plant limits states and inputs together": within[::-1],
         "its box counts between samples": (Certificate.load(CHECKED_IN / "oscillator.json"), between),
     }

@@ -38,7 +38,7 @@ from tests.verdicts import verified
 @pytest.mark.parametrize("name", MIXED)
 def test_fallback_keeps_every_limit_from_every_state_by_linear_programs(name):
     plant, found = PLANTS[name], certificate(name)
-    P, K, n = found.polytope, found.K, plant.n
+    P, K, n = found.safe_set, found.K, plant.n
     faces = [(g, high) for g, high in zip(P.rows, P.high, strict=True) if np.isfinite(high)]
     faces += [(-g, -low) for g, low in zip(P.rows, P.low, strict=True) if np.isfinite(low)]
     A_ub, b_ub = np.array([g for g, _ in faces]), np.array([end for _, end in faces])
@@ -76,13 +76,13 @@ def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name)
     plant, found = PLANTS[name], certificate(name)
     closer = altered(plant, mixed_ends=0.3 * plant.mixed_ends)
     claimed = replace(found, fingerprint=closer.fingerprint)
-    P, first = found.polytope, len(found.polytope.rows) + plant.m
+    P, first = found.safe_set, len(found.safe_set.rows) + plant.m
     upper, lower = P.multipliers.copy(), P.lower_multipliers.copy()
     upper[first, np.abs(upper[first]).argmax()] += 0.5
     lower[first, np.abs(lower[first]).argmax()] -= 0.5
-    forged = [(replace(found, polytope=replace(P, multipliers=upper, lower_multipliers=lower)), plant)]
+    forged = [(replace(found, safe_set=replace(P, multipliers=upper, lower_multipliers=lower)), plant)]
     few = replace(P, multipliers=P.multipliers[:first], lower_multipliers=P.lower_multipliers[:first])
-    forged += [(claimed, closer), (replace(found, polytope=few), plant)]
+    forged += [(claimed, closer), (replace(found, safe_set=few), plant)]
     for each, claims in forged:
         assert not verified(each, claims).valid
 

@@ -12,10 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import cart_pole
+from ncs_gym import Ellipsoid, cart_pole
 from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.registration import CART_POLE_CHANNEL
 from shields.errors import Infeasible
+from shields.polytope import Polytope
 from shields.synthesis import invariant_polytope as search
 from shields.synthesis.polytope_certificates import certified_polytope, with_polytope
 from shields.synthesis.resting_point import at_operating_point
@@ -39,20 +40,18 @@ def found(name):
 def test_polytopes_fill_much_more_of_the_box_and_both_verifiers_prove_them(name):
     _, certificate, plant = found(name)
     wide = with_polytope(certificate, plant)
-    assert wide.provenance["polytope_share_of_box"] >= IDS[name] > certificate.provenance["share_of_box"]
+    assert wide.provenance["share_of_box"] >= IDS[name] > certificate.provenance["share_of_box"]
     assert verified(wide, plant).valid
-    assert wide.safe_set is wide.polytope
-    assert replace(wide, polytope=None, provenance=certificate.provenance) == certificate
     # The ellipsoid lies inside: it is invariant under the same gain, and the polytope is the largest such set.
     points = certificate.safe_set.sample_boundary(np.random.default_rng(0), 2000)
-    assert wide.polytope.gauge(points).max() <= 1.0 + 1e-5
+    assert wide.safe_set.gauge(points).max() <= 1.0 + 1e-5
 
 
 @pytest.mark.parametrize("name", IDS)
 def test_share_that_a_gain_keeps_is_that_of_its_polytope(name):
     wide, certificate, plant = found(name)
     points = search.points_of_box(plant, 12)
-    inside = wide.polytope.gauge(points) <= 1.0
+    inside = wide.safe_set.gauge(points) <= 1.0
     feedback = search.feedback_of(certificate)
     assert search.share_of_points(feedback, plant, points) == pytest.approx(inside.mean(), abs=2.0 / len(points))
     unstable = feedback._replace(K=-1e3 * certificate.K)
@@ -64,7 +63,7 @@ def test_without_a_polytope_within_the_limits_the_certificate_says_why(monkeypat
     certificate = certificate_of(plant, contract_of(CART_POLE_CHANNEL))
     monkeypatch.setattr(search, "MOST_ROWS", 50)
     narrow = with_polytope(certificate, plant)
-    assert narrow.polytope is None
+    assert isinstance(narrow.safe_set, Ellipsoid)
     text = " ".join(str(narrow).split())
     assert (
         "more than 50 rows, fewer with longer steps or less disturbance; shields keep the state in the ellipsoid"
@@ -88,7 +87,7 @@ def test_box_with_nearly_the_same_row_twice_has_its_polytope(again):
     plant = small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], again]))
     found = synthesize(plant)
     assert verified(found, plant).valid
-    assert found.polytope is not None
+    assert isinstance(found.safe_set, Polytope)
 
 
 def test_box_of_more_rows_than_a_polytope_has_says_so():
@@ -127,9 +126,9 @@ def test_polytope_of_too_many_rows_is_replaced_by_a_coarser_one_that_is_nearly_a
     monkeypatch.setattr(search, "MOST_ROWS", 12)
     found = certified_polytope(plant, np.zeros((1, 3)), None, at_operating_point(plant), lines.append)
     assert sum("more than 12 rows" in line for line in lines) == 1
-    assert len(found.polytope.rows) <= 12
+    assert len(found.safe_set.rows) <= 12
     assert verified(found, plant).valid
-    assert found.provenance["polytope_share_of_box"] == pytest.approx(0.956, abs=0.002)
+    assert found.provenance["share_of_box"] == pytest.approx(0.956, abs=0.002)
 
 
 def test_state_that_no_limit_sees_is_limited_so_that_a_polytope_has_an_end():
@@ -140,7 +139,7 @@ def test_state_that_no_limit_sees_is_limited_so_that_a_polytope_has_an_end():
     found = synthesize(plant, contract=ChannelContract(1))
     assert verified(found, plant).valid
     # Disturbances of 1e-3 alone take the second state to 5e-3.
-    np.testing.assert_array_less([0.999, 0.01], found.polytope.support(np.eye(2)))
+    np.testing.assert_array_less([0.999, 0.01], found.safe_set.support(np.eye(2)))
 
 
 def test_errors_that_leave_a_face_alone_leave_no_polytope():
@@ -159,9 +158,11 @@ def test_search_for_a_polytope_that_is_ended_leaves_the_ellipsoid():
             raise TimeoutError
 
     found = synthesize(plant, time_limit=1e6, progress=late)
-    assert found.polytope is None
+    assert isinstance(found.safe_set, Ellipsoid)
     assert found.provenance["interrupted_at"].startswith("polytope, when the time_limit")
-    np.testing.assert_array_equal(found.L, synthesize(plant, safe_set="ellipsoid").L)
+    np.testing.assert_array_equal(
+        found.safe_set.shape_matrix, synthesize(plant, safe_set="ellipsoid").safe_set.shape_matrix
+    )
 
 
 def test_numbers_out_of_reach_leave_the_ellipsoid(monkeypatch):
@@ -172,7 +173,7 @@ def test_numbers_out_of_reach_leave_the_ellipsoid(monkeypatch):
 
     monkeypatch.setattr(search, "Extremes", failing)
     narrow = with_polytope(certificate, plant)
-    assert narrow.polytope is None
+    assert isinstance(narrow.safe_set, Ellipsoid)
     assert "out of reach of float64" in narrow.provenance["no_polytope"]
 
 
@@ -195,19 +196,19 @@ def assert_polytope_holds(seed, n, m):
         wide = synthesize(plant, safe_set="polytope")
     except Infeasible:
         return
-    assert (wide.polytope is None) == ("no_polytope" in wide.provenance)
-    if wide.polytope is None:
+    assert (isinstance(wide.safe_set, Ellipsoid)) == ("no_polytope" in wide.provenance)
+    if isinstance(wide.safe_set, Ellipsoid):
         return
     assert verified(wide, plant).valid
     rng = np.random.default_rng(seed)
-    x = wide.polytope.sample_boundary(rng, 300)
+    x = wide.safe_set.sample_boundary(rng, 300)
     error, push = wide.error_set.sample_boundary(rng, 300), plant.disturbance.sample_boundary(rng, 300)
     u = (x + error) @ wide.K.T
     assert (np.abs(u) <= plant.u_max).all()
-    assert wide.polytope.gauge(x @ plant.A.T + u @ plant.B.T + push).max() <= 1.0
+    assert wide.safe_set.gauge(x @ plant.A.T + u @ plant.B.T + push).max() <= 1.0
     # By another route: for every row the farthest state, error and disturbance.
-    for row in wide.polytope.rows:
-        image = wide.polytope.support(row @ (plant.A + plant.B @ wide.K))
+    for row in wide.safe_set.rows:
+        image = wide.safe_set.support(row @ (plant.A + plant.B @ wide.K))
         assert image + wide.error_set.support(row @ plant.B @ wide.K) + plant.disturbance.support(row) <= 1.0
 
 

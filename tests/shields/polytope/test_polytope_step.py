@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import gymnasium as gym
@@ -22,15 +21,15 @@ ALL = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleTw
 
 
 @cache
-def wide_certificate(name):
+def wide_certificate(name, kind="polytope"):
     env = gym.make(f"ncs_gym/{name}-v0").unwrapped
-    return certificate_of(env.plant, env.certificate_contract, "polytope"), env.plant
+    return certificate_of(env.plant, env.certificate_contract, kind), env.plant
 
 
 def situations(shield, count, seed=0):
     """Estimates in and a little out of the polytope, error shapes, and proposals: (count, n), (n, n), (count, m)."""
     rng = np.random.default_rng(seed)
-    polytope, plant = shield.certificate.polytope, shield.plant
+    polytope, plant = shield.certificate.safe_set, shield.plant
     estimates = polytope.sample_boundary(rng, count) * rng.uniform(0.3, 1.15, (count, 1))
     return estimates, 0.5 * shield.certificate.Sigma, rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.u_max
 
@@ -102,13 +101,13 @@ def test_what_is_not_usable_ends_in_the_fallback(value):
 
 def test_starts_are_decided_exactly():
     certificate, _ = wide_certificate("BatchReactor")
-    polytope = certificate.polytope
+    polytope = certificate.safe_set
     corner = polytope.sample_boundary(np.random.default_rng(0), 1)[0]
     assert starts_inside(certificate, (1.0 - 1e-12) * corner)
     assert not starts_inside(certificate, (1.0 + 1e-12) * corner)
-    assert not starts_inside(replace(certificate, polytope=None), (1.0 - 1e-12) * corner)
-    assert starts_inside(certificate, certificate.ellipsoid)
-    assert not starts_inside(certificate, Ellipsoid(2.0 * certificate.L))
+    inside = wide_certificate("BatchReactor", "ellipsoid")[0].safe_set
+    assert starts_inside(certificate, inside)
+    assert not starts_inside(certificate, Ellipsoid(4.0 * inside.shape_matrix))
 
 
 def test_polytope_of_a_plant_with_one_state_is_an_interval():
@@ -117,5 +116,5 @@ def test_polytope_of_a_plant_with_one_state_is_an_interval():
         measurement_noise_cov=[[1e-6]], initial_cov=[[1e-6]],
     )  # fmt: skip
     certificate = certificate_of(plant, ChannelContract(2), "polytope")
-    np.testing.assert_array_equal(certificate.polytope.rows[0], plant.box_rows[0])
+    np.testing.assert_array_equal(certificate.safe_set.rows[0], plant.box_rows[0])
     assert safety_filter(certificate, plant).decide(np.zeros(1), certificate.Sigma, np.zeros(1)).reason == "safe"

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import linprog
 
 from benchmarks.published import channel_of, contract_of_plant, plant_of, published
-from ncs_gym import ChannelContract, contract_of
+from ncs_gym import ChannelContract, Ellipsoid, contract_of
 from ncs_gym.limits import MovedOperatingPointWarning
 from shields import CertificateError, Infeasible
 from shields.synthesis.resting_point import farthest_equilibrium, improved
@@ -24,7 +24,7 @@ from tests.verdicts import broken, verified
 @pytest.mark.parametrize("name", ASYMMETRIC)
 def test_polytope_has_the_plants_ends_and_its_rest_is_an_equilibrium(name):
     plant, found = PLANTS[name], certificate(name)
-    P, k = found.polytope, len(plant.box)
+    P, k = found.safe_set, len(plant.box)
     np.testing.assert_array_equal(P.rows[:k], plant.box)
     np.testing.assert_array_equal([P.low[:k], P.high[:k]], plant.box_ends)
     x, u = found.resting_state, found.resting_input
@@ -42,9 +42,9 @@ def test_limit_with_one_end_alone_is_kept():
     )  # fmt: skip
     found = certificate_of(room, CONTRACT, "polytope")
     assert verified(found, room).valid
-    assert found.polytope.high[0] == np.inf
-    reached = found.polytope.rows[1:] @ np.array([1e6])
-    assert ((reached > found.polytope.high[1:]) | (reached < found.polytope.low[1:])).any()
+    assert found.safe_set.high[0] == np.inf
+    reached = found.safe_set.rows[1:] @ np.array([1e6])
+    assert ((reached > found.safe_set.high[1:]) | (reached < found.safe_set.low[1:])).any()
 
 
 def test_an_input_may_rest_at_an_end_and_a_state_may_not():
@@ -70,18 +70,14 @@ def test_an_input_may_rest_at_an_end_and_a_state_may_not():
 
 
 @pytest.mark.parametrize("name", ASYMMETRIC)
-def test_ellipsoid_is_inside_the_polytope_around_the_resting_point_as_the_certificate_says(name):
-    plant, found = PLANTS[name], certificate(name)
-    boundary = found.resting_state + found.ellipsoid.sample_boundary(np.random.default_rng(0), 2000)
-    assert found.polytope.gauge(boundary).max() <= 1.0 + 1e-9
-    assert max(map(max, map(plant.constraint_values, boundary))) <= 1e-9
-    text = " ".join(str(found).split())
-    assert ("(x - x_c)'M(x - x_c) <= 1, that reaches |x_i - x_c,i| <=" in text) == found.resting_state.any()
+def test_printed_resting_point_has_nothing_that_is_left_of_rounding(name):
+    text = " ".join(str(certificate(name)).split())
+    assert ("u = u_c + K (x_hat - x_c), with x_c =" in text) == certificate(name).resting_state.any()
     assert "e-1" not in text.partition("fallback")[2].partition("contract")[0]  # what is left of rounding
 
 
 def changed(found, **fields):
-    return replace(found, polytope=replace(found.polytope, **fields))
+    return replace(found, safe_set=replace(found.safe_set, **fields))
 
 
 def moved(array, index, by):
@@ -93,7 +89,7 @@ def moved(array, index, by):
 def mutants(name):
     """What a certificate that is changed a little claims falsely, or can no longer prove."""
     found, plant = certificate(name), PLANTS[name]
-    P = found.polytope
+    P = found.safe_set
     for j in range(len(P.rows)):
         if np.isfinite(P.high[j]):
             yield f"upper end {j}", changed(found, high=moved(P.high, j, 0.01))
@@ -108,7 +104,7 @@ def mutants(name):
             )
     yield "resting input", replace(found, resting_input=found.resting_input + 0.02 * plant.input_half)
     shifted = found.resting_state + 0.02 * plant.half_widths
-    yield "center", replace(found, resting_state=shifted, polytope=replace(P, center=shifted))
+    yield "center", replace(found, resting_state=shifted, safe_set=replace(P, center=shifted))
 
 
 @pytest.mark.cases(1)
@@ -125,7 +121,7 @@ def test_changed_certificate_is_refused_by_both_engines(name):
 
 def is_invariant(found, plant):
     """Whether the polytope is kept for sure, by linear programs of our own: then a changed end claims nothing false."""
-    P = found.polytope
+    P = found.safe_set
     rows, ends = [], []
     for g, low, high in zip(P.rows, P.low, P.high, strict=True):
         rows += [g] * np.isfinite(high) + [-g] * np.isfinite(low)
@@ -154,17 +150,16 @@ def within_symmetric(plant):
 def test_ellipsoid_is_not_kept_around_a_resting_point():
     plant = within_symmetric(ANGLE)
     found = certificate_of(plant, CONTRACT)
-    assert found.keeps_ellipsoid
+    assert isinstance(found.safe_set, Ellipsoid)
     for other, claims in (
-        (replace(found, resting_state=[0.01, 0.0], polytope=None), plant),
-        (replace(found, resting_input=[1e-9], polytope=None), plant),
+        (replace(found, resting_input=[1e-9]), plant),
         (replace(found, fingerprint=ANGLE.fingerprint), ANGLE),
     ):
         assert broken(other, claims) == ["S: an ellipsoid is kept only around zero, within symmetric limits"]
 
 
 def test_center_that_is_not_inside_and_ends_the_wrong_way_are_no_certificate():
-    P = certificate("angle").polytope
+    P = certificate("angle").safe_set
     for fields in ({"center": [5.0, 0.0]}, {"low": P.high, "high": P.low}, {"low": np.full(len(P.rows), np.nan)}):
         with pytest.raises(CertificateError):
             replace(P, **fields)
@@ -216,7 +211,7 @@ def test_state_without_a_limit_is_bounded_by_what_the_others_allow():
     )
     found = certificate_of(plant, ChannelContract(max_age=2), "polytope")
     assert verified(found, plant).valid
-    assert np.isfinite(found.polytope.widths).all()
+    assert np.isfinite(found.safe_set.widths).all()
 
 
 @pytest.mark.parametrize("name", published())
@@ -235,7 +230,7 @@ def test_published_plant_is_accepted_as_its_authors_write_it(name):
 @pytest.mark.parametrize("name", ASYMMETRIC)
 def test_first_rows_of_a_polytope_have_the_ends_of_the_box(name):
     """A plan ends in the polytope if it passes the box's own ends in these rows: closer ones would not be tested."""
-    plant, P = PLANTS[name], certificate(name).polytope
+    plant, P = PLANTS[name], certificate(name).safe_set
     for field, by in (("low", 1e-6), ("high", -1e-6)):
         ends = moved(getattr(P, field), 0, by)
         if not np.isfinite(ends[0]):

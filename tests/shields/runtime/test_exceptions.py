@@ -111,7 +111,7 @@ DATA = np.zeros(2), np.ones((4, len(PLANT.box_rows))), np.eye(2), 1.0, np.empty(
 
 @pytest.mark.parametrize("raised", RAISED)
 def test_solver_that_does_not_come_to_its_end_has_no_answer_and_is_not_asked_again(monkeypatch, raised):
-    prediction = Prediction(ellipsoid_test(certificate_of(PLANT).L, PLANT), 4)
+    prediction = Prediction(ellipsoid_test(certificate_of(PLANT).safe_set.shape_matrix, PLANT), 4)
     answer, program = PlanProgram(prediction).solve(*DATA), PlanProgram(prediction)
 
     class Breaking:
@@ -135,7 +135,7 @@ def test_solver_that_does_not_come_to_its_end_has_no_answer_and_is_not_asked_aga
 
 def test_plans_of_inputs_with_uneven_ends_begin_with_what_is_proposed_or_its_end():
     plant = altered(PLANT, input_limits=([-1.0], [4.0]))
-    program = PlanProgram(Prediction(ellipsoid_test(certificate_of(PLANT).L, plant), 4))
+    program = PlanProgram(Prediction(ellipsoid_test(certificate_of(PLANT).safe_set.shape_matrix, plant), 4))
     for proposed, closest in ((3.0, 3.0), (9.0, 4.0), (-9.0, -1.0)):
         plan = program.solve(*DATA[:-1], np.array([proposed]))
         np.testing.assert_allclose(plan[0], closest, atol=1e-4)

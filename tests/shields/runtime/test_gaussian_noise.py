@@ -10,7 +10,7 @@ from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.plants.library import batch_reactor
 from shields.runtime.guarantee import ALARM
 from shields.runtime.safety_filter import MODES
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, metric
 from tests.product import library_plant, linear_plant, vector_env, vector_shield
 from tests.shields.attacks.adversary import gauges
 
@@ -79,7 +79,7 @@ def share_of_exits(delta, noise):
     outside = np.zeros(COUNT, np.bool_)
     for _ in range(STEPS):
         *_, info = shield.step(rng.uniform(-1.0, 1.0, (COUNT, plant.m)).astype(np.float32))
-        outside |= np.einsum("ki,ij,kj->k", info["state"], certificate.M, info["state"]) > 1.0
+        outside |= np.einsum("ki,ij,kj->k", info["state"], metric(certificate), info["state"]) > 1.0
     return outside.mean()
 
 

@@ -6,7 +6,7 @@ from scipy.optimize import minimize_scalar
 
 from ncs_gym import Ellipsoid, truck_trailer
 from shields.runtime.set_test import ellipsoid_test
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, metric
 from tests.plants import random_plant
 from tests.product import altered, safety_filter
 from tests.shields.edges import edge_of
@@ -26,7 +26,7 @@ def case(request):
 
 def predicted(certificate, plant, shape):
     """The ellipsoid of next states around their center, in coordinates where M = I, and h."""
-    root = np.linalg.cholesky(certificate.M).T
+    root = np.linalg.cholesky(metric(certificate)).T
     first, second = root @ plant.A @ shape @ plant.A.T @ root.T, root @ plant.disturbance.shape_matrix @ root.T
     share = np.sqrt(np.trace(first)) / (np.sqrt(np.trace(first)) + np.sqrt(np.trace(second)))
     P = first / share + second / (1 - share)
@@ -67,7 +67,7 @@ def cases(certificate, plant, rng, count):
 
 def test_margin_is_that_of_the_formula(case):
     plant, certificate = case
-    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(0)
+    test, rng = ellipsoid_test(certificate.safe_set.shape_matrix, plant), np.random.default_rng(0)
     for estimate, shape, u in cases(certificate, plant, rng, 100):
         root, P, h = predicted(certificate, plant, shape)
         c = root @ (plant.A @ estimate + plant.B @ u)
@@ -81,7 +81,7 @@ def test_margin_is_that_of_the_formula(case):
 
 def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
     plant, certificate = case
-    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(1)
+    test, rng = ellipsoid_test(certificate.safe_set.shape_matrix, plant), np.random.default_rng(1)
     sharper = agree = exactly = 0
     for estimate, shape, u in cases(certificate, plant, rng, 160):
         root, P, h = predicted(certificate, plant, shape)
@@ -113,7 +113,7 @@ def test_the_test_lies_between_the_sufficient_and_the_exact_one(case):
 def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
     # By another route: ascent over the errors and disturbances themselves, not over an ellipsoid around them.
     plant, certificate = case
-    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(2)
+    test, rng = ellipsoid_test(certificate.safe_set.shape_matrix, plant), np.random.default_rng(2)
     tight = 0.0
     for estimate, shape, u in cases(certificate, plant, rng, 24):
         with np.errstate(all="ignore"):
@@ -124,7 +124,7 @@ def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
         for _ in range(10):
             e, d = errors.sample_boundary(rng), plant.disturbance.sample_boundary(rng)
             for _ in range(30):
-                slope = certificate.M @ (center - plant.A @ e + d)
+                slope = metric(certificate) @ (center - plant.A @ e + d)
                 e, d = errors.extreme_point(-plant.A.T @ slope), plant.disturbance.extreme_point(slope)
             level = certificate.safe_set.gauge(center - plant.A @ e + d)
             tight = max(tight, level)
@@ -134,7 +134,7 @@ def test_passing_inputs_are_the_ones_the_worst_case_allows(case):
 
 def test_smallest_test_margin_is_that_of_the_worst_input(case, monkeypatch):
     plant, certificate = case
-    test, rng = ellipsoid_test(certificate.L, plant), np.random.default_rng(3)
+    test, rng = ellipsoid_test(certificate.safe_set.shape_matrix, plant), np.random.default_rng(3)
     for estimate, shape, _ in cases(certificate, plant, rng, 30):
         sets = reachable(test, estimate, shape)
         inputs = rng.uniform(-1, 1, (500, plant.m)) * plant.u_max
@@ -198,7 +198,7 @@ def test_decomposition_that_fails_says_nothing(monkeypatch):
 def test_what_cannot_be_used_spoils_no_other_shape_of_the_batch():
     plant = PLANTS["3, 2"]
     certificate = certificate_of(plant)
-    test, good = ellipsoid_test(certificate.L, plant), 0.5 * certificate.Sigma
+    test, good = ellipsoid_test(certificate.safe_set.shape_matrix, plant), 0.5 * certificate.Sigma
     swap = good + np.eye(3)[[1, 0, 2]]
     bad = [np.full((3, 3), np.nan), np.full((3, 3), np.inf), -good, 1e308 * np.eye(3), swap]
     errors = test.predicted(np.array([good, *bad, good]), certificate.error_shapes)

@@ -118,7 +118,11 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
             (7, ValueError, "certificate must be a Certificate"),
             ("missing.json", CertificateError, "cannot read certificate"),
             (certificate_of(OTHER), CertificateError, "another plant"),
-            (replace(CERTIFICATE, L=1.5 * CERTIFICATE.L), CertificateError, "does not verify"),
+            (
+                replace(CERTIFICATE, safe_set=Ellipsoid(1.5 * CERTIFICATE.safe_set.shape_matrix)),
+                CertificateError,
+                "does not verify",
+            ),
         )
     ],
     (lambda: ShieldSettings(CERTIFICATE, on_unproved="maybe"), ValueError, "on_unproved must be one of"),
@@ -136,7 +140,11 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: LoopConfig(env="CSTR-v0"), ValueError, "is no registered environment"),
     (lambda: LoopConfig(env="ncs_gym/Nothing-v0"), ValueError, "'ncs_gym/Nothing-v0' is no registered environment"),
     # Filters.
-    (lambda: SafetyFilter(replace(CERTIFICATE, L=1.1 * CERTIFICATE.L), PLANT), CertificateError, r"\(S\)"),
+    (
+        lambda: SafetyFilter(replace(CERTIFICATE, safe_set=Ellipsoid(1.1 * CERTIFICATE.safe_set.shape_matrix)), PLANT),
+        CertificateError,
+        r"\(S\)",
+    ),
     (lambda: SafetyFilter(CERTIFICATE, OTHER), CertificateError, "another plant"),
     *[
         (partial(SafetyFilter, *given), ValueError, "a shield takes a Certificate")

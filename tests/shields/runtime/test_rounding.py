@@ -32,7 +32,7 @@ def exact_level(certificate, plant, x, u, d):
     column = lambda vector: [[Fraction(float(entry))] for entry in vector]  # noqa: E731
     moved = zip(multiply(rational(plant.A), column(x)), multiply(rational(plant.B), column(u)), column(d), strict=True)
     p, q = (sum(row[0] for row in rows) for rows in moved)
-    (a, b), (_, c) = rational(certificate.L)
+    (a, b), (_, c) = rational(certificate.safe_set.shape_matrix)
     return float((c * p * p - 2 * b * p * q + a * q * q) / (a * c - b * b) - 1)
 
 
@@ -40,7 +40,7 @@ def worst_disturbance(certificate, plant, x, u):
     """Roughly the worst d on the boundary of E(D), shrunk so that it is inside."""
     d = np.zeros(2)
     for _ in range(5):
-        slope = np.linalg.solve(certificate.L, plant.A @ x + plant.B @ u + d)
+        slope = np.linalg.solve(certificate.safe_set.shape_matrix, plant.A @ x + plant.B @ u + d)
         d = plant.nominal_disturbance.extreme_point(slope)
     return (1 - 1e-12) * d
 
@@ -180,7 +180,7 @@ def test_gain_too_large_for_float64_is_refused(monkeypatch, certificate, loaded)
 def test_gain_may_be_as_large_as_float64_computes_it_accurately(certificate, loaded):
     # A quarter of a float32 step of the limit, against n + 2 roundings of sums of |K| |x_hat|.
     thin = with_proof(certificate, Sigma=certificate.Sigma * [[1.0, 0.1], [0.1, 0.01]])
-    extent = np.sqrt(np.diag(thin.L)) + np.sqrt(np.diag(thin.Sigma))
+    extent = np.sqrt(np.diag(thin.safe_set.shape_matrix)) + np.sqrt(np.diag(thin.Sigma))
     assert extent[0] > 1.05 * extent[1] or extent[1] > 1.05 * extent[0]
     largest = 0.25 * 2.0**-24 * 4.0 / (4 * 2.0**-52 * extent.sum())
     require_computable(replace(thin, K=0.99 * largest * np.array([[1.0, -1.0]])), loaded)

@@ -170,7 +170,7 @@ def test_start_is_in_the_safe_set_only_if_estimate_or_set_say_so():
     for known in (edge, certificate.safe_set):
         loop.start(edge, initial_set=known)
         assert loop.guaranteed
-    loop.start(edge, initial_set=Ellipsoid(1.01 * certificate.L))
+    loop.start(edge, initial_set=Ellipsoid(1.01 * certificate.safe_set.shape_matrix))
     assert loop.reason == NOT_KNOWN_INSIDE
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from shields.runtime.guard import NumberedErrors
 from shields.runtime.safety_filter import MARGIN, MODES, REASONS
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, metric
 from tests.plants import random_plant
 from tests.product import altered, safety_filter
 from tests.shields.edges import edge_of, gained
@@ -173,7 +173,7 @@ def test_public_helpers_refuse_what_decide_would_call_invalid(certificate, loade
 def test_known_inside_ends_at_the_edge(certificate, loaded):
     shield, shape = safety_filter(certificate, loaded), 0.04 * certificate.Sigma
     direction = certificate.safe_set.extreme_point(np.array([1.0, 0.3]))
-    radius = np.sqrt(np.linalg.eigvals(certificate.M @ shape).real.max())
+    radius = np.sqrt(np.linalg.eigvals(metric(certificate) @ shape).real.max())
     assert shield.knows_inside((1.0 - radius - 1e-6) * direction, shape)
     assert not shield.knows_inside((1.0 - radius + 1e-9) * direction, shape)
     assert not shield.knows_inside((1.0 - radius - 0.5 * MARGIN) * direction, shape)  # inside, but by too little

@@ -51,7 +51,7 @@ def gust(rng, plant, nominal_next):
 
 def edge(plant, scale):
     """Starts in the ellipsoid of the plant's own certificate, blown up or shrunk."""
-    return {"initial_set": Ellipsoid(scale**2 * certificate_of(plant).L)}
+    return {"initial_set": Ellipsoid(scale**2 * certificate_of(plant).safe_set.shape_matrix)}
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from ncs_gym import AdversarialDisturbance, truck_trailer
 from shields import SafetyShield
 from shields.runtime.guarantee import OTHER_INPUT, OTHER_STEPS
-from tests.certificates import certificate_of
+from tests.certificates import certificate_of, metric
 from tests.product import loop_env, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
@@ -95,7 +95,7 @@ class Repeats(gym.Wrapper):
 @pytest.mark.parametrize("mode", ["project", "lookahead", "boundary", "switch"])
 @pytest.mark.parametrize("name", INSIDE)
 def test_no_wrapper_inside_the_shield_breaks_its_promise(name, mode):
-    nature = AdversarialDisturbance(CERTIFICATE.M)
+    nature = AdversarialDisturbance(metric(CERTIFICATE))
     env = safety_shield(INSIDE[name](loop_env(PLANT, disturbance=nature)), CERTIFICATE, mode)
     bare = loop_env(PLANT, disturbance=nature)
     rng, broken = np.random.default_rng(0), 0

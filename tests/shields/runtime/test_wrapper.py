@@ -11,6 +11,7 @@ from shields import SafetyShield
 from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
 )
+from tests.certificates import metric
 from tests.product import safety_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -107,7 +108,11 @@ def test_monitor_is_the_unshielded_environment_bit_for_bit(certificate):
 
 
 def test_monitor_keeps_the_proof_while_nothing_unsafe_is_proposed(certificate):
-    env = shielded(certificate, mode="monitor", disturbance=AdversarialDisturbance(certificate.M))
+    env = shielded(
+        certificate,
+        mode="monitor",
+        disturbance=AdversarialDisturbance(metric(certificate)),
+    )
     gain = certificate.K / env.filter.plant.u_max[:, None]
     infos = play(env, lambda info: gain @ info["estimate"], seed=0)
     assert all(info["shield_guaranteed"] for info in infos)

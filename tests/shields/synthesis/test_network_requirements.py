@@ -79,5 +79,5 @@ def test_known_age_of_the_pendulum():
 
 def test_share_is_that_of_what_shields_keep_and_of_open_boxes_none():
     kept = limited("angle")
-    assert share_of(kept) == ("polytope", kept.provenance["polytope_share_of_box"])
+    assert share_of(kept) == ("polytope", kept.provenance["share_of_box"])
     assert share_of(replace(kept, provenance={})) == ("certificate", 1.0)

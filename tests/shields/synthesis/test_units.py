@@ -63,7 +63,7 @@ def found(plant: LinearPlant, contract: ChannelContract | None) -> tuple[str, li
     except Infeasible as infeasible:
         return infeasible.binding, [infeasible.shortfall]
     assert verify(certificate, plant).valid
-    names = "polytope_share_of_box", "tolerated_scale"
+    names = "share_of_box", "tolerated_scale"
     return "certified", [certificate.provenance.get(name, 0.0) for name in names]
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ncs_gym import Ellipsoid
 from shields import Certificate
 from tests.certificates import certificate_of, with_proof
 from tests.plants import named
@@ -33,7 +34,9 @@ def test_any_other_last_digit_makes_another_certificate(certificate, by_age):
         array.flat[place] = np.nextafter(array.flat[place], 1.0)
         return array
 
-    for name in ("L", "K", "D"):
+    larger = Ellipsoid(moved(certificate.safe_set.shape_matrix))
+    assert replace(certificate, safe_set=larger) != certificate
+    for name in ("K", "D"):
         assert replace(certificate, **{name: moved(getattr(certificate, name))}) != certificate, name
     for each in (certificate, by_age):
         for age, proof in enumerate(each.proofs):
@@ -51,7 +54,7 @@ def test_printed_certificate_says_what_it_is_for(certificate, by_age):
     assert "fallback" in text
     assert "2 states, 1 input" in text
     # A plane's largest ellipse fills pi/4 of its parallelogram.
-    volume = np.sqrt(np.linalg.det(certificate.L)) * np.pi / 16.0  # the box is 4 by 4
+    volume = np.sqrt(np.linalg.det(certificate.safe_set.shape_matrix)) * np.pi / 16.0  # the box is 4 by 4
     assert f"{100.0 * volume:.4g} % of the safe box's volume" in text
     assert "99.97 % of the largest ellipsoid" in text
     assert "none: any packets may be lost or late" in text

@@ -79,7 +79,7 @@ def test_only_positive_definiteness_excludes_a_flat_set():
     noise = dict.fromkeys(("process_noise_cov", "initial_cov"), np.zeros((2, 2))) | {"measurement_noise_cov": np.eye(2)}
     plant = library_plant(truck_trailer, gamma=0.0, **noise)
     certificate = certificate_of(plant)
-    flat = replace(certificate, L=np.zeros((2, 2)), K=np.zeros((1, 2)))
+    flat = replace(certificate, safe_set=Ellipsoid(np.zeros((2, 2))), K=np.zeros((1, 2)))
     found = broken(flat, plant)
     assert any("L > 0" in name for name in found)
 
@@ -116,6 +116,6 @@ def test_certificate_of_delayed_inputs_allows_inputs_at_their_limits():
     certificate = certificate_of(plant)
     assert verified(certificate, plant).valid
     rows = plant.box_rows[:2]
-    assert (np.einsum("ij,jk,ik->i", rows, certificate.L, rows) <= 1.0).all()
+    assert (np.einsum("ij,jk,ik->i", rows, certificate.safe_set.shape_matrix, rows) <= 1.0).all()
     assert certificate.safe_set.support(np.eye(plant.n)[0]) > 0.5
     assert certificate.safe_set.gauge(np.array([0.0, 0.0, 0.8])) < 1.0

@@ -10,7 +10,7 @@ from flint import fmpq, fmpq_mat
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import truck_trailer
+from ncs_gym import Ellipsoid, truck_trailer
 from ncs_gym.uncertainty.ellipsoid import TruncatedGaussian, truncation_energy
 from shields import verify
 from shields.verification.rational_matrix import is_positive_semidefinite, rational
@@ -110,7 +110,7 @@ def test_large_limits_and_small_multipliers_are_judged_alike():
     for rounding in (1e-30, 1e-9, 1e-3, 1e3, 5e-324):
         verified(with_multipliers(certificate, rounding=rounding), plant)
     for factor in (1e-300, 1e-30, 1e30, 1e70):
-        verified(replace(certificate, L=factor * certificate.L), plant)
+        verified(replace(certificate, safe_set=Ellipsoid(factor * certificate.safe_set.shape_matrix)), plant)
         verified(replace(certificate, K=factor * certificate.K), plant)
 
 
