@@ -130,13 +130,8 @@ def shares(names: Names = ()) -> None:
             kept = f"to {min(reached):.1f} %", ""
         else:
             kept = f"{share:.3f}", f"{at_most:.2f}"
-        show(
-            name,
-            *known,
-            *kept,
-            len(certificate.safe_set.rows) if isinstance(certificate.safe_set, Polytope) else "",
-            took,
-        )
+        S = certificate.safe_set
+        show(name, *known, *kept, len(S.rows) if isinstance(S, Polytope) else "", took)
     print(f"{found} of {len(names or published())} have a certificate")
 
 
