@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 import ncs_gym
+from ncs_gym import Ellipsoid
 from shields.verification.rational_matrix import add, congruence, is_positive_semidefinite, rational, scale, subtract
 from tests.certificates import ROOT, certificate_of, metric
 from tests.product import altered, family_of, linear_plant, safety_filter
@@ -146,7 +147,7 @@ def reordered(certificate, plant, order):
     return (
         replace(
             certificate,
-            L=certificate.safe_set.shape_matrix[square],
+            safe_set=Ellipsoid(certificate.safe_set.shape_matrix[square]),
             K=certificate.K[:, order],
             proofs=tuple(replace(proof, Sigma=proof.Sigma[square]) for proof in certificate.proofs),
             D=certificate.D[square],

@@ -26,7 +26,7 @@ RUNS = 2 * (len(TRAINED) + len(FIXED))
 
 def test_smoke_run_leaves_every_file_of_the_contract(smoke):
     out, run = smoke
-    assert "% of the largest ellipsoid in the box)" in run.prose
+    assert "% of the safe box's volume)" in run.prose
     assert "A smoke run shows that everything runs" in run.prose
     assert "training and evaluation: 100%" in run.stderr
     left = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "tensorboard" not in path.parts}
@@ -224,7 +224,7 @@ def test_damaged_and_foreign_certificates_are_one_sentence(certificate, tmp_path
     certificate.save(tmp_path / "c.json")
     text = (tmp_path / "c.json").read_text()
     (tmp_path / "cut.json").write_text(text[: len(text) // 2])
-    (tmp_path / "changed.json").write_text(text.replace('"error": 0.', '"error": 0.1', 1))
+    (tmp_path / "changed.json").write_text(text.replace('"rounding": 0.', '"rounding": 0.1', 1))
     assert_one_sentence(ncs("verify", tmp_path / "cut.json"), "not valid JSON")
     assert_one_sentence(ncs("verify", tmp_path / "changed.json"), "altered")
     foreign = ["compare", "--env", "ncs_gym/TruckTrailer-v0", "--certificate", tmp_path / "c.json"]
