@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from dataclasses import replace
 
 import cvxpy as cp
@@ -115,15 +114,6 @@ def test_outputs_that_do_not_tell_a_direction_leave_no_upper_bound_of_it():
     with pytest.raises(ValueError, match="does not tell the state: give first_error"):
         found.bounds(2.0, of="explaining")
     assert found.bounds(2.0, of="explaining", first_error=0.1).disturbance.half == pytest.approx(2 * found.explaining)
-
-
-@pytest.mark.slow
-def test_two_thousand_steps_of_four_states_take_twenty_seconds_at_most():
-    model, _, half, phi = case_of("cart_pole")
-    u, y, _ = driven(model, 2000, half, phi)
-    before = time.process_time()
-    bounds_from_recording(model, u, y, sensor=phi)
-    assert time.process_time() - before <= 20.0
 
 
 @pytest.mark.parametrize(("sizes", "mismatch"), [(lambda u: np.abs(u), 1.0), (None, 1.3)])

@@ -158,25 +158,6 @@ def test_other_environments_go_on_when_a_longer_delay_joins_in_the_middle_of_the
         np.testing.assert_array_equal(short, long)
 
 
-def test_errors_stay_in_their_ellipsoids_whatever_channels_are_drawn():
-    def draw(rng):
-        loss = [0.0, 0.5, BURSTS][rng.integers(3)]
-        loop = {"quantization_step": 0.05 * rng.random(), "send_period": int(rng.integers(1, 4))}
-        return Channel(loss, delay=int(rng.integers(6)), jitter=int(rng.integers(4)), **loop)
-
-    coarse = Channel(quantization_step=0.05)
-    env = VectorRandomChannel(vector_env(32, plant=PLANT, channel=coarse, max_episode_steps=13), draw)
-    _, info = env.reset(seed=2)
-    seen = set()
-    for _ in range(150):
-        e, shapes = info["estimation_error"], info["error_shape"]
-        assert np.einsum("ki,ki->k", e, np.linalg.solve(shapes, e[..., None])[..., 0]).max() <= 1.0 + 1e-9
-        assert not info["assumption_violated"].any()
-        seen |= set(env.unwrapped.episode_channels)
-        info = env.step(env.action_space.sample())[4]
-    assert len(seen) > 300
-
-
 def test_draws_follow_from_the_seed_and_pickled_wrappers_draw_the_same():
     env = RandomChannel(gym.make("ncs_gym/TruckTrailer-v0"), LATE)
     again = pickle.loads(pickle.dumps(env))

@@ -90,17 +90,6 @@ def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(see
         np.testing.assert_allclose(estimator.covariance, covariance, atol=1e-10)
 
 
-def test_episodes_are_counted_from_the_first_one_on():
-    plant, episodes = truck_trailer(), []
-    estimator, moved = (Estimator(plant, Channel()) for _ in range(2))
-    moved.advance(np.zeros(1), [Packet(1, np.zeros(2))])
-    assert (moved.episode, moved.age) == (0, 0)
-    for each in (estimator, estimator, moved):
-        each.reset(np.zeros(2))
-        episodes.append(each.episode)
-    assert episodes == [0, 1, 1]
-
-
 def worst_noise(rng, plant):
     """Sensor noise on the boundary of its bound."""
     return plant.sensor_noise.bound.sample_boundary(rng)

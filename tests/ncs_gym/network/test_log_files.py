@@ -329,23 +329,6 @@ def test_numbers_of_ping_go_on_after_16_bits(answered, written):
     assert np.allclose(np.diff(log.sent), 1.0)
 
 
-def test_stamp_that_was_printed_late_makes_no_packet_fresher(written):
-    lines = [("0.1", "0.1"), ("1.1", "0.1"), ("3.15", "0.1"), ("3.2", "0.2"), ("4.1", "0.1")]  # the third was late
-    answers = [(n, Fraction(moment) - Fraction(delay), delay) for n, (moment, delay) in enumerate(lines, 1)]
-    log = PacketLog.load(written(run(answers, 5)))
-    assert log.sent[2] == log.sent[3]
-    assert np.allclose(log.sent + log.delays, [float(moment) for moment, _ in lines])
-
-
-def test_packets_that_a_receiver_did_not_log_are_not_seen(written):
-    """Where the loop's sample was lost, the next packet of the step takes its place, if nobody says so."""
-    rows = [f"{n / 20},{'' if n % 4 == 2 else n / 20 + 0.01}\n" for n in range(41)]
-    both = PacketLog.load(written("sent,received\n" + "".join(rows)))
-    alone = PacketLog.load(written("sent,received\n" + "".join(row for row in rows if not row.endswith(",\n"))))
-    assert (both.ages(0.1).max(), alone.ages(0.1).max()) == (2, 1)
-    assert np.isnan(both.delays).sum() == 10
-
-
 def test_sample_that_is_later_than_any_channel_allows_counts_as_lost():
     log = PacketLog(np.arange(1500.0), np.array([*2 * [np.nan], 1000.0, 1001.0, *1496 * [np.nan]]))
     assert log.trace(1.0)[:4] == (-1, -1, 1000, -1)

@@ -8,7 +8,6 @@ import pytest
 
 from experiments.commands.channel import broken_contracts, count_interval, stalls
 from ncs_gym import Channel, PacketLog, TraceChannel, contract_of
-from ncs_gym.network.packet_loss_and_delay import ChannelState
 
 
 def test_log_is_laid_over_the_steps_of_a_loop():
@@ -44,23 +43,6 @@ def test_contract_of_a_replay_is_the_oldest_age_of_three_rounds(seed):
     assert promised.max_age == max(ages_by_hand(5 * trace, channel.send_period, steps))
     losses, delay = channel.max_consecutive_losses, channel.longest_delay
     assert promised.max_age <= (losses + 1) * channel.send_period + delay - 1
-
-
-def test_replay_is_the_record_from_a_random_packet_on():
-    trace = (0, -1, 2, -1, -1, 1)
-    channel = TraceChannel(trace=trace)
-    assert (channel.delay, channel.jitter, channel.max_consecutive_losses) == (0, 2, 2)
-    seen = set()
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        state, arrivals = ChannelState(channel, rng), {}
-        for step in range(1, 13):
-            for packet in state.exchange(rng, step, np.zeros(1)):
-                arrivals[packet.stamp] = step - packet.stamp
-        delays = tuple(arrivals.get(stamp, -1) for stamp in range(1, 7))
-        assert delays in {trace[i:] + trace[:i] for i in range(6)}
-        seen.add(delays)
-    assert len(seen) == 6
 
 
 def test_longest_run_of_losses_counts_across_the_end():

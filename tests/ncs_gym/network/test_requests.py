@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, TraceChannel, cart_pole, truck_trailer
+from ncs_gym import Channel, ChannelContract, cart_pole, truck_trailer
 from ncs_gym.network.requests import Requests, spare_samples
 from tests.product import loop_env, vector_env
 
@@ -177,16 +177,3 @@ def test_requests_behind_a_downlink_take_effect_when_the_input_does():
     env.request()
     packets = [env.step(np.zeros(1, np.float32))[-1]["packets"] for _ in range(5)]
     assert packets == [1, 2, 3, 4, 4]  # three by agreement, and the one asked for
-
-
-def test_trace_on_request_keeps_the_contract():
-    channel = TraceChannel(trace=(1, -1, 2, -1, -1, 2), on_request=True, quantization_step=1e-4)
-    settings = {"plant": cart_pole(), "channel": channel, "contract": ChannelContract(8, 1e-4)}
-    env, rng = vector_env(50, **settings), np.random.default_rng(0)
-    env.reset(seed=0)
-    ages = []
-    for _ in range(300):
-        env.request(rng.random(50) < 0.1)
-        *_, info = env.step(np.zeros((50, 1), np.float32))
-        ages.append(info["measurement_age"].max())
-    assert max(ages) == 8

@@ -75,14 +75,6 @@ def rollout(env, steps=30, seed=5):
     return np.array(rows)
 
 
-def test_linear_process_is_the_default():
-    channel = Channel(loss=0.3)
-    for kind in (loop_env, lambda *given, **named: vector_env(3, plant=given[0], channel=given[1], **named)):
-        np.testing.assert_array_equal(
-            rollout(kind(plant(), channel)), rollout(kind(plant(), channel, process=LinearProcess()))
-        )
-
-
 @pytest.mark.parametrize("vectorized", [False, True])
 def test_function_with_the_plants_equations_moves_like_the_plant(vectorized):
     process = FunctionProcess(linear, vectorized)

@@ -168,24 +168,6 @@ def test_outline_of_a_set_is_around_its_projection_and_touches_it():
     assert (tight <= 1.01).all()
 
 
-def test_header_and_panel_show_interventions_and_violations():
-    acting = replace(QUIET, intervened=True, interventions=1)
-    frames = [picture(step=1, input=1.0, annotation=note) for note in (QUIET, acting)]
-    bar = theme.Rect(theme.PANEL.x, theme.PANEL.y + 16, theme.PANEL.w, 16)
-    beyond = theme.Rect(bar.right - bar.w / 4, bar.y, bar.w / 4, bar.h)  # between the applied input and the proposed
-    for rect in (theme.HEADER, bar):
-        assert count(frames[1], theme.SHIELD, rect) > count(frames[0], theme.SHIELD, rect) + 100
-    assert count(frames[0], theme.SHIELD, beyond) == 0
-    assert count(frames[1], theme.SHIELD, beyond) > 60
-    assert count(frames[1], theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) > 10_000
-    watching = picture(step=1, input=4.0, annotation=replace(acting, protects=False))
-    assert count(watching, theme.SHIELD_FILL, theme.PLANT_VIEW, off=4) == 0
-    safe, over = picture(), picture((2.5, 0.0), violations=1)
-    assert count(safe, theme.DANGER, theme.HEADER) == 0
-    assert count(over, theme.DANGER, theme.HEADER) > 1000
-    assert count(over, theme.DANGER_FILL, theme.PLANT_VIEW, off=4) > 10_000
-
-
 def test_packets_are_lost_and_late_as_the_channel_says():
     def packets(channel, steps=12):
         env = make(channel=channel).unwrapped
