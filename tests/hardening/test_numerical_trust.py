@@ -14,10 +14,6 @@ from tests.fuzz import examples, plants
 from tests.product import loop_env, safety_shield, synthesize
 from tests.verdicts import verified
 
-SIZES = [
-    (n, m, seed, radius) for n, m in ((1, 1), (2, 1), (3, 2), (4, 2)) for seed in (0, 1) for radius in (0.99, 0.9999)
-]
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.99, 0.999, 0.9999])

@@ -55,7 +55,7 @@ def test_channel_keeps_the_contract_derived_from_it_and_no_better_one(channel):
     # By another route: the newest sample that has arrived, counted packet by packet.
     contract, rng = contract_of(channel), np.random.default_rng(0)
     link, newest, oldest = ChannelState(channel, rng), 0, 0
-    for step in range(1, 5_000):
+    for step in range(1, 2_000):
         sample = np.zeros(1) if link.sends_at(step) else None
         newest = max([newest, *(packet.stamp for packet in link.exchange(rng, step, sample))])
         oldest = max(oldest, step - newest)
@@ -129,10 +129,9 @@ def test_update_falls_back_to_the_certified_gain_and_never_skips(monkeypatch):
     assert used > 25
 
 
-@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
-def test_breaking_the_contract_is_reported_when_it_happens(env_id):
-    whole = gym.make(env_id).unwrapped.channel
-    env = gym.make(env_id, channel=replace(whole, max_consecutive_losses=None, loss=1.0)).unwrapped
+def test_breaking_the_contract_is_reported_when_it_happens():
+    whole = gym.make("ncs_gym/CartPole-v0").unwrapped.channel
+    env = gym.make("ncs_gym/CartPole-v0", channel=replace(whole, max_consecutive_losses=None, loss=1.0)).unwrapped
     env.reset(seed=0)
     for step in range(1, 12):
         info = env.step(np.zeros(env.plant.m))[4]
