@@ -139,19 +139,6 @@ def test_graphs_of_many_plants_are_not_kept_for_ever(monkeypatch):
     assert list(shared.values()) == [*graphs[2:], graphs[1]]
 
 
-def test_a_graph_has_room_for_many_environments(monkeypatch):
-    # With fewer histories than environments it would be forgotten at every step.
-    monkeypatch.setattr(arrival_histories, "_shared", {})
-    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 20)
-    env = vector_env(100, plant=truck_trailer(), channel=Channel(loss=0.3, jitter=3))
-    env.reset(seed=0)
-    graphs = []
-    for _ in range(50):
-        env.step(np.zeros((100, 1), np.float32))
-        graphs.append(env._now.estimator.histories)
-    assert 2 < len(set(map(id, graphs))) < 60
-
-
 def test_a_damaged_measurement_is_not_used_and_harms_no_other():
     env = vector_env(3, plant=truck_trailer(), channel=Channel(jitter=3))
     env.reset(seed=0)

@@ -128,7 +128,7 @@ def test_error_stays_in_its_running_ellipsoid_under_adversarial_noise(channel, s
 
     Sigma = certified_error_set(plant).Sigma
     largest = 0.0
-    for estimator, x in drive(plant, channel, seed, 100, push):
+    for estimator, x in drive(plant, channel, seed, 70, push):
         shape = estimator.shape
         largest = max(largest, Ellipsoid(shape).gauge(estimator.mean - x))
         assert np.linalg.eigvalsh(Sigma - shape)[0] >= -1e-15
@@ -145,7 +145,7 @@ def test_samples_are_used_however_wide_the_box_of_another_state_is(channel):
         disturbance_bound=[0.02, 0.01], sensor_bound=0.02, initial_bound=[0.05, 0.05],
     )  # fmt: skip
     Sigma, ages, speeds, gauges = certified_error_set(plant).Sigma, [], [], []
-    for estimator, x in drive(plant, channel, 0, 300, lambda rng: np.diag(rng.uniform(0.0, 1.0, 2))):
+    for estimator, x in drive(plant, channel, 0, 200, lambda rng: np.diag(rng.uniform(0.0, 1.0, 2))):
         shape = estimator.shape
         ages.append(estimator.age)
         speeds.append(np.sqrt(shape[0, 0]))

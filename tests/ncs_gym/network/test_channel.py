@@ -48,7 +48,7 @@ def test_loss_alone_may_be_given_without_its_name():
 
 def test_gilbert_elliott_loses_in_bursts_at_its_stationary_rate():
     loss = GilbertElliott(p_good_to_bad=0.05, p_bad_to_good=0.2)
-    arrivals = transmit(Channel(loss=loss), 60_000)
+    arrivals = transmit(Channel(loss=loss), 40_000)
     lost = np.array([not stamps for stamps in arrivals.values()])
     assert lost.mean() == pytest.approx(0.2, abs=0.015)
     ends = np.flatnonzero(np.diff(lost.astype(int)) == -1)

@@ -131,15 +131,6 @@ KINDS = {
         times("1", ["0.012", "0.15"]),
         "0.05",
     ),
-    "ping from an interface, with a pause and no packet on a multiple of the step": Kind(
-        run(
-            [(n, sent, "0.012") for n, sent in enumerate(("0", "0.05", "0.1", "7.4", "7.45", "7.50", "7.55"), 1)],
-            7,
-            header="PING 192.0.2.1 (192.0.2.1) from 192.0.2.7 wlan0: 56(84) bytes of data.\n",
-        ),
-        [(s, Fraction(s) + Fraction("0.012")) for s in ("0", "0.05", "0.1", "7.4", "7.45", "7.5", "7.55")],
-        "0.07",
-    ),
 }
 
 

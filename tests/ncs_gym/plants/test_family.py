@@ -70,8 +70,8 @@ def between(function, ranges, count, seed=0):
 @pytest.mark.parametrize(
     ("plant", "members", "widths"),
     [
-        (TRUCK, between(truck_trailer, MASSES, 20), (2.0, 2.0, 4.0)),
-        (POLES, between(cart_pole, POLE, 8), (2.4, 3.0, 0.2, 2.0, 10.0)),
+        (TRUCK, between(truck_trailer, MASSES, 10), (2.0, 2.0, 4.0)),
+        (POLES, between(cart_pole, POLE, 4), (2.4, 3.0, 0.2, 2.0, 10.0)),
         (HULL, [np.hstack([each.A, each.B]) for each in TRUCKS], (2.0, 2.0, 4.0)),
     ],
 )

@@ -83,16 +83,3 @@ def test_text_shows_limits_bounds_and_sampling_time_with_units():
     ):
         assert words in text
     assert "dynamics        stable (spectral radius 0.493817)" in str(truck_trailer())
-
-
-def test_limits_of_coupled_inputs_are_listed_where_inputs_take_effect_later():
-    plant = linear_plant(
-        A=0.9 * np.eye(2), B=np.eye(2), dt=0.1, box=[1.0, 2.0], u_max=[1.0, 1.0],
-        disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.01, input_delay=1,
-        mixed_limits=[([0.0, 0.0], [1.0, 1.0], -0.5, 0.5)],
-    )  # fmt: skip
-    assert "|u1 of 1 step ago + u2 of 1 step ago| <= 0.5\n" in str(plant)
-    assert "|u2| <= 1\n                inputs take effect 1 step later\n" in str(plant)
-    assert str(plant).count("of 1 step ago") == 2  # rows of past inputs alone limit nothing
-    state = [0.5, -3.0, 0.0, 0.2]
-    np.testing.assert_array_equal(plant.constraint_values(state), plant.constraint_values(np.array(state)))
