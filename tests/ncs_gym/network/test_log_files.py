@@ -281,6 +281,14 @@ def test_numbers_of_ping_go_on_after_16_bits(answered, written):
     assert np.allclose(np.diff(log.sent), 1.0)
 
 
+def test_stamp_that_was_printed_late_makes_no_packet_fresher(written):
+    lines = [("0.1", "0.1"), ("1.1", "0.1"), ("3.15", "0.1"), ("3.2", "0.2"), ("4.1", "0.1")]  # the third was late
+    answers = [(n, Fraction(moment) - Fraction(delay), delay) for n, (moment, delay) in enumerate(lines, 1)]
+    log = PacketLog.load(written(run(answers, 5)))
+    assert log.sent[2] == log.sent[3]
+    assert np.allclose(log.sent + log.delays, [float(moment) for moment, _ in lines])
+
+
 def test_sample_that_is_later_than_any_channel_allows_counts_as_lost():
     log = PacketLog(np.arange(1500.0), np.array([*2 * [np.nan], 1000.0, 1001.0, *1496 * [np.nan]]))
     assert log.trace(1.0)[:4] == (-1, -1, 1000, -1)
