@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from ncs_gym import Channel, ChannelContract, Task, cart_pole
 from ncs_gym.envs.spaces import ClippedObservationWarning
 from tests.certificates import certificate_of
-from tests.product import linear_plant, loop_env, safety_shield, vector_env
+from tests.product import gym_env, linear_plant, loop_env, safety_shield, vector_env
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANT = linear_plant(A=[[0.5]], B=[[1.0]], box=[[1.0]], u_max=1.0, dt=0.1, gamma=1e-4, sensor_bound=0, initial_bound=0)
@@ -68,14 +68,10 @@ def test_entries_beyond_their_bound_are_told_of_once(make):
 
 
 def test_longer_vector_episodes_have_a_longer_horizon_and_longer_scalar_ones_a_warning():
-    gym.register("Test/Far-v0", entry_point="ncs_gym.registration:LINEAR_NCS", max_episode_steps=200)
-    try:
-        env = gym.make("Test/Far-v0", plant=PLANT, task=Far(), max_episode_steps=300)
-        with pytest.warns(ClippedObservationWarning, match="give horizon=... if episodes are longer"):
-            play(env, 300)
-        long = gym.make("Test/Far-v0", plant=PLANT, task=Far(), max_episode_steps=300, horizon=300)
-    finally:
-        del gym.registry["Test/Far-v0"]
+    env = gym_env(plant=PLANT, task=Far(), max_episode_steps=300)
+    with pytest.warns(ClippedObservationWarning, match="give horizon=... if episodes are longer"):
+        play(env, 300)
+    long = gym_env(plant=PLANT, task=Far(), max_episode_steps=300, horizon=300)
     many = vector_env(2, plant=PLANT, task=Far(), max_episode_steps=300)
     assert many.single_observation_space == long.observation_space
     assert many.horizon == 300

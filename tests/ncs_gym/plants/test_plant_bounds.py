@@ -6,9 +6,6 @@ import pytest
 import ncs_gym
 from ncs_gym import Ellipsoid, truck_trailer
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.processes.cart_pole_process import nonlinear_cart_pole
-from ncs_gym.processes.gym_pendulum import pendulum
-from ncs_gym.processes.mujoco_pendulum import inverted_pendulum
 from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.product import altered, linear_plant
@@ -44,25 +41,6 @@ def test_declared_bound_adds_to_what_covariances_and_gamma_bound(name, kind):
     for direction in np.random.default_rng(0).standard_normal((200, 2)):
         need = getattr(base, SETS[name]).support(direction) + getattr(plant, name).support(direction)
         assert getattr(plant, SETS[name]).support(direction) >= need * (1 - 1e-8)
-
-
-# Certificates and agents that are stored belong to these.
-REGISTERED = {
-    truck_trailer: "95e3532724d6",
-    lambda: truck_trailer(4000.0): "03c8442904a7",
-    ncs_gym.cart_pole: "a24fdb2082ae",
-    ncs_gym.plants.library.batch_reactor: "c4e17ad0a41a",
-    pendulum: "8ec05e31669c",
-    nonlinear_cart_pole: "bc0bbe28eb93",
-    inverted_pendulum: "484e1ba16a42",
-}
-
-
-@pytest.mark.parametrize("make", REGISTERED)
-def test_registered_plants_keep_their_fingerprints(make):
-    plant = make()
-    assert plant.fingerprint.startswith(REGISTERED[make])
-    assert altered(plant, dt=2.0 * plant.dt, continuous_model=None, remainder=None).fingerprint != plant.fingerprint
 
 
 @pytest.mark.cases(8)
