@@ -430,3 +430,4 @@ def test_environments_may_change_their_actions_in_place(downlink, is_vector):
             acted = k + 1.0 if downlink is None else [0.25, 0.25, 1.0, 2.0, 3.0, 4.0][k]
             assert np.ravel(info["acted"]) == np.ravel(info["action_applied"]) == acted
             assert action == k + 1.0
+            action[:] = -9.0  # which is the agent's own

@@ -10,7 +10,7 @@ from tests.ncs_gym.networked.environments import Counter
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
 PAIRS = gym.spaces.Tuple([gym.spaces.Discrete(2)])
-LATE = Channel(loss=0.4, delay=1, jitter=2)
+LATE, SECOND = Channel(loss=0.4, delay=1, jitter=2), Channel(delay=2, send_period=2)
 KEYS = "measurement_age", "packet_arrived", "action_age", "action_applied", "packets"
 
 
@@ -50,17 +50,18 @@ def test_one_environment_is_that_of_the_single_network(settings):
 
 
 @pytest.mark.parametrize(
-    ("mode", "resets"),
+    ("mode", "resets", "channel"),
     [
-        (AutoresetMode.NEXT_STEP, False),
-        (AutoresetMode.NEXT_STEP, True),  # as SB3VecEnv does
-        (AutoresetMode.SAME_STEP, False),
-        (AutoresetMode.DISABLED, True),
+        (AutoresetMode.NEXT_STEP, False, SECOND),
+        (AutoresetMode.NEXT_STEP, True, SECOND),  # as SB3VecEnv does
+        (AutoresetMode.SAME_STEP, False, SECOND),
+        (AutoresetMode.SAME_STEP, False, Channel()),
+        (AutoresetMode.DISABLED, True, SECOND),
     ],
 )
-def test_episodes_that_end_at_different_times_begin_anew_alone(mode, resets):
+def test_episodes_that_end_at_different_times_begin_anew_alone(mode, resets, channel):
     lengths = 5, 7, 11
-    settings = {"channel": Channel(delay=2, send_period=2), "downlink": Channel(delay=1)}
+    settings = {"channel": channel, "downlink": Channel(delay=1)}
     makes = [lambda length=length: Counter(length=length) for length in lengths]
     many = VectorNetworked(SyncVectorEnv(makes, autoreset_mode=mode), **settings)
     singles = [Networked(make(), **settings) for make in makes]
