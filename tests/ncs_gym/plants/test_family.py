@@ -235,6 +235,13 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
     family_in(document)["members"][0][1][2] *= 3.0
     with pytest.raises(ValueError, match="must lie in its interval"):
         LinearPlant.load(document)
+    late = family_of(
+        [linear_plant(**SMALL, input_delay=1), linear_plant(**SMALL | {"B": [[0.0], [0.4]]}, input_delay=1)]
+    )
+    document = json.loads(json.dumps(late.document))
+    family_in(document)["members"][0][2][3] *= 0.5  # of the input under way
+    with pytest.raises(ValueError, match="must have the past inputs of the plant of the middle"):
+        LinearPlant.load(document)
 
 
 @pytest.mark.parametrize(
