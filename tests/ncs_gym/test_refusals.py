@@ -252,6 +252,7 @@ REQUESTS = [
     lambda: NCSEnv(PLANT).reset(options={"channel": Channel(on_request=True)}),
     lambda: NCSVectorEnv(2, plant=PLANT, channel=[Channel(), Channel()]),
     lambda: RequestActions(gym.make(POLE)),
+    lambda: RequestActions(gym.make("CartPole-v1")),
     lambda: RequestActions(gym.make(POLE, **ASKED), -1.0),
     lambda: VectorRequestActions(gym.make_vec(POLE, num_envs=2, autoreset_mode="SameStep", **ASKED)),
     lambda: RequestActions(gym.make(POLE, **ASKED)).step(np.array([0.0, np.nan])),
@@ -353,7 +354,7 @@ PLANTS = [
     *(partial(zero_order_hold, np.array([[size]]), np.array([[1.0]]), 1.0) for size in (1e3, 1e13, 1e20)),
     plant_in(None),
     folder_for_a_file,
-    *map(plant_in, ("{", b"\xff\xfe", "[" * 100_000, '{"format": "ncs-gym plant 2", "model": 3}')),
+    *map(plant_in, ("{", b"\xff\xfe", "[" * 100_000, "[]", '{"format": "ncs-gym plant 2", "model": 3}')),
     *map(
         plant_with,
         (
@@ -404,6 +405,7 @@ PROCESSES = [
         {"process": kinked_late()},
         {"process": LinearProcess()},
         {"process": 3},
+        {"process": GymProcess(lambda: gym.make("Pendulum-v1"), lambda env: env.unwrapped.state)},
         {"process": GymProcess(lambda: gym.make("CartPole-v1"), lambda env: np.zeros(2))},
         {"state": [1.0, 1.0, 1.0]},
         {"samples": 5},
@@ -411,6 +413,7 @@ PROCESSES = [
         {"matrices": (np.eye(2), np.ones((3, 1)))},
         {"jacobian_bounds": SLOPES, "matrices": (np.eye(2), np.ones((2, 1)))},
         {"jacobian_bounds": SLOPES[::-1]},
+        {"jacobian_bounds": 3},
         {"jacobian_bounds": (SLOPES[1], SLOPES[1])},
         *({"jacobian_bounds": SLOPES, "process": FunctionProcess(noisy, each)} for each in (False, True)),
     ),

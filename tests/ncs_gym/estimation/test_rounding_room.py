@@ -140,11 +140,11 @@ def test_an_update_that_keeps_the_error_or_takes_the_noise_alone_needs_the_infla
     assert room >= plant.estimate_rounding if gain else room == plant.estimate_rounding
 
 
-@pytest.mark.parametrize(("error", "noise"), [(1e4, 1e-6), (1e-6, 1e4)])
-def test_room_holds_what_the_residual_of_a_large_error_or_of_large_noise_rounds(error, noise):
+@pytest.mark.parametrize(("error", "noise", "size"), [(1e4, 1e-6, 1.0), (1e-6, 1e4, 10.0), (1e-6, 1e-6, 1e3)])
+def test_room_holds_what_a_large_error_large_noise_or_a_large_gain_rounds(error, noise, size):
     """Two sensors that agree but for little: each is far off, their difference is not."""
     matched = np.array([[1.0], [0.7]])
-    gain = np.array([[1.0, 0.0]]) if error > noise else np.array([[7.0, -10.0]])
+    gain = np.array([[1.0, 0.0]]) if error > noise else size * np.array([[0.7, -1.0]])
     own = Ellipsoid(noise**2 * matched @ matched.T + 1e-12 * np.eye(2))  # the gain does not see what is common to both
     settings = {"box": [1.0], "u_max": 1.0, "dt": 0.1, "disturbance_bound": 0.0, "initial_bound": 0.0}
     plant = linear_plant(A=[[0.5]], B=[[1.0]], H=matched, sensor_bound=own, **settings)

@@ -11,6 +11,7 @@ from ncs_gym import (
     Ellipsoid,
     ErrorSetError,
     GilbertElliott,
+    Packet,
     cart_pole,
     contract_of,
     truck_trailer,
@@ -136,6 +137,16 @@ def test_breaking_the_contract_is_reported_when_it_happens():
     for step in range(1, 12):
         info = env.step(np.zeros(env.plant.m))[4]
         assert info["contract_broken"] is (step > env.contract.max_age)
+
+
+def test_a_long_outage_ends_no_episode_with_an_exception():
+    settings = {"u_max": 1.0, "dt": 0.1, "gamma": 1e-4, "measurement_noise_cov": 1e-6 * np.eye(2)}
+    plant = linear_plant(A=[[1.2]], B=[[1.0]], box=[[1.0]], H=[[1.0], [1.0]], **settings)
+    estimator = Estimator(plant, Channel(), certified_error_set(plant, ChannelContract(2)))
+    estimator.reset(np.zeros(1))
+    for step in range(1, 160):
+        estimator.advance(np.zeros(1), [] if step < 150 else [Packet(step, np.zeros(2))])
+    assert np.isfinite(estimator.mean).all()
 
 
 def test_prediction_falls_back_to_the_certified_set(monkeypatch):

@@ -113,6 +113,15 @@ def test_outstanding_samples_are_those_requested_and_newer_than_the_newest():
         assert env.outstanding == sum(stamp > step - info["measurement_age"] for stamp in stamps)
 
 
+def test_outstanding_samples_without_a_contract_are_those_that_may_still_arrive():
+    env = loop_env(plant=truck_trailer(), channel=Channel(loss=1.0, delay=2, on_request=True))
+    env.reset(seed=0)
+    for step in range(1, 9):
+        env.request()
+        env.step(np.zeros(1, np.float32))
+        assert env.outstanding == min(step, 2)
+
+
 def test_stable_plant_without_a_contract_is_never_forced_to_a_sample():
     env = vector_env(3, plant=truck_trailer(), channel=Channel(0.3, delay=2, on_request=True))
     env.reset(seed=0)
@@ -125,6 +134,15 @@ def test_stable_plant_without_a_contract_is_never_forced_to_a_sample():
     assert info["packets"].tolist() == [1, 0, 1]
     *_, info = env.step(np.zeros((3, 1), np.float32))  # a request is about one sample
     assert info["packets"].tolist() == [1, 0, 1]
+
+
+def test_broken_contract_forces_a_request_in_every_step():
+    env = cart_pole_loop(loop_env)
+    dead = Channel(1.0, delay=1, jitter=1, quantization_step=1e-4, on_request=True)
+    env.reset(seed=0, options={"channel": dead})
+    infos = [env.step(np.zeros(1, np.float32))[-1] for _ in range(40)]
+    assert all(info["request_forced"] for info in infos if info["measurement_age"] > 10)
+    assert infos[-1]["contract_broken"]
 
 
 @pytest.mark.parametrize("kind", [loop_env, vector_env])

@@ -219,14 +219,18 @@ def test_network_does_not_depend_on_what_the_environment_draws():
 def test_actions_on_their_way_stay_as_they_are(kind):
     """Whatever the agent writes into its own."""
     box = spaces.Box(-100.0, 100.0, (1,), np.float32)
-    own, buffer = (spaces.Dict(a=box), np.zeros(1, np.float32)) if kind == "dict" else (box, torch.zeros(1))
-    action, acted = {"a": buffer} if kind == "dict" else buffer, []
+    own = spaces.Dict(a=spaces.Tuple([box])) if kind == "dict" else box
+    buffer, acted = np.zeros(1, np.float32) if kind == "dict" else torch.zeros(1), []
+    action = {"a": (buffer,)} if kind == "dict" else buffer
+
+    def number(action):
+        return float((action["a"][0] if kind == "dict" else action)[0])
 
     class Listening(Counter):
         action_space = own
 
         def step(self, action):
-            acted.append(float((action["a"] if kind == "dict" else action)[0]))
+            acted.append(number(action))
             return super().step(np.zeros(1))
 
     env = Networked(Listening(), downlink=Channel(delay=2))
@@ -236,7 +240,7 @@ def test_actions_on_their_way_stay_as_they_are(kind):
         buffer[0] = k + 1.0
         told.append(env.step(action)[-1]["action_applied"])
     assert acted == [0.0, 0.0, 1.0, 2.0, 3.0, 4.0]
-    assert [float((each["a"] if kind == "dict" else each)[0]) for each in told] == acted
+    assert [number(each) for each in told] == acted
 
 
 @pytest.mark.parametrize("downlink", [{"delay": 3}, {"jitter": 3, "loss": 0.3, "max_consecutive_losses": 2}])

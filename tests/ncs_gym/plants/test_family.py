@@ -316,6 +316,7 @@ SAMPLED = sampled_plant(MODEL, dt=0.1, box=[1.0, 2.0], u_max=1.0, between_sample
 LEFT_OUT = Remainder(Ellipsoid(1e-4 * np.eye(2)), False, "an example")
 REFUSED = {
     "nothing between the ends": (lambda: family_of(truck_trailer, MASSES), "say monotone=True if"),
+    "no ranges": (lambda: family_of(truck_trailer), "ranges must be a dictionary of 1 to 6"),
     "no range": (lambda: family_of(truck_trailer, {"mass": 4000.0}, monotone=True), r"must be \(low, high\)"),
     "ends": (lambda: family_of(truck_trailer, {"mass": (4.0, 3.0)}, monotone=True), "low < high"),
     "ranges of plants": (lambda: family_of(TRUCKS, MASSES), "about a function"),

@@ -80,13 +80,16 @@ def test_gymnasiums_checker_renders_without_a_warning():
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (12, 2)])
-def test_plants_of_any_size_are_drawn(n, m):
+def test_plants_of_any_size_are_drawn_and_what_a_shield_does(n, m):
     env = make("ncs_gym/LinearNCS-v0", plant=random_plant(0, n, m), channel=Channel(loss=0.3, jitter=3))
     env.reset(seed=0)
-    inner, note = env.unwrapped, Annotation(safe_set=Ellipsoid(np.eye(n)), label="project")
+    acting = {"proposed": 9.0 * np.ones(m), "intervened": True, "interventions": 1, "protects": n > 1}
+    note = Annotation(safe_set=Ellipsoid(np.eye(n)), label="project", **acting)
     *_, info = env.step(env.action_space.sample())
-    inner.renderer.record(info, None, None, note)
-    assert count(env.render(), theme.SAFE_FILL, theme.PLANE) > 1000
+    env.unwrapped.renderer.record(info, None, None, note)
+    frame = env.render()
+    assert count(frame, theme.SAFE_FILL, theme.PLANE) > 1000
+    assert (count(frame, theme.SHIELD, theme.HEADER) > 2000) is (n > 1)
 
 
 def test_plan_is_drawn_through_the_states_that_follow_from_its_inputs(loaded):

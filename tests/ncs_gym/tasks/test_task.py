@@ -124,6 +124,7 @@ def written(state, u):
     ("pays", "words"),
     [
         (lambda state, u: -np.square(u), "the reward of Paying.* must be a number"),
+        (lambda state, u: None, "the reward of Paying.* must be a number"),
         (lambda state, u: np.nan * state[0], "the reward of Paying.* must be a number"),
         (written, "read-only"),
     ],
