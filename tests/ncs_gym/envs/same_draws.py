@@ -250,15 +250,8 @@ def compare(
 ) -> Seen:
     """Steps a vector and, with the same draws, scalar environments; compares everything that both say.
 
-    With a certificate all are shielded, and a loop without Gymnasium runs beside each scalar shield.
-
-    Args:
-        many: The vector environment.
-        steps: How many steps.
-        options: Of the first reset.
-        certificate: That of the shields; None compares bare environments.
-        mode: Of the shields.
-        anew: Before which steps every third environment is reset alone.
+    With a certificate all are shielded, and a loop without Gymnasium runs beside each scalar shield. The options are of
+    the first reset; before the steps in `anew` every third environment is reset alone.
     """
     shielded = certificate is not None
     settings = {"mode": mode, "penalty": 0.25, "on_unproved": "ignore"}
