@@ -81,17 +81,17 @@ def test_proved_bound_holds_what_a_step_from_rest_leaves_out(offset):
 
 
 def test_proved_bound_reaches_to_the_farther_end():
-    """The same kink between -0.5 and 2, with an input between -1 and 3: attained at the far ends."""
+    """The same kink between -0.5 and 2, with an input between -3 and 1: attained at the far ends."""
 
     def kinked(state, u):
         return 0.5 * state + 0.3 * u + 0.1 * np.abs(state) + 0.05 * np.abs(u)
 
-    limits = {"state_limits": (4.5, 7.0), "operating_state": 5.0, "input_limits": (-2.0, 2.0), "operating_input": -1.0}
+    limits = {"state_limits": (4.5, 7.0), "operating_state": 5.0, "input_limits": (-2.0, 2.0), "operating_input": 1.0}
     bounds = [[0.4, 0.25]], [[0.6, 0.35]]
     plant = linear_model(kinked, dt=0.1, jacobian_bounds=bounds, samples=200, **limits, **QUIET)
     reach = np.sqrt(plant.remainder.bound.shape_matrix.item())
     np.testing.assert_allclose(reach, 0.1 * 2.0 + 0.05 * 3.0, rtol=1e-6)
-    np.testing.assert_allclose(reach, kinked(2.0, 3.0) - plant.A.item() * 2.0 - plant.B.item() * 3.0, rtol=1e-6)
+    np.testing.assert_allclose(reach, kinked(2.0, -3.0) - plant.A.item() * 2.0 + plant.B.item() * 3.0, rtol=1e-6)
 
 
 LEVEL, FLOW = 0.6, 0.5 * np.sqrt(0.6)
