@@ -209,6 +209,7 @@ ENVIRONMENTS = [
             "initial_set": [np.eye(2), {"radius": 1.0}],
             "disturbance": ["storm", {"M": 1.0}],
             "channel": [{"los": 0.1}, {"loss": {"p": 0.1}}, {"loss": 2.0}],
+            "contract": [{}],
             "observe": ["speed", ["age", "age"], [1]],
             "process": [{"pole_mass": 0.1}],
         },
