@@ -4,8 +4,6 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ncs_gym import (
     AdversarialDisturbance,
@@ -29,13 +27,13 @@ from ncs_gym import (
 )
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.uncertainty.disturbances import BallDisturbance
-from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS, examples
+from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS
 
 PLANT = truck_trailer()
 WRONG = [*NOTHING_USABLE, *WRONG_NUMBERS]
 THREE = np.eye(3)
 FRACTIONS = [1.5, np.float64(2.0), 1.0, 2**31, 10**30]
-NOT_MATRICES = [*WRONG, np.full((2, 2), np.nan), np.eye(2) * 1e80, [[1, 2]], [[True, False], [False, True]], THREE]
+NOT_MATRICES = [*WRONG, np.diag([1.0, np.nan]), np.eye(2) * 1e80, [[1, 2]], [[True, False], [False, True]], THREE]
 NOT_COVARIANCES = [*NOT_MATRICES, -np.eye(2), [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.1], [0.0, 1.0]]]
 NOT_COVARIANCES += [np.diag([1e12, -1e-3]), [[1e12, 1.0], [1.0, 0.0]], [[1e12, 1e3], [1e3, 1e-8]]]
 FLAGS = [*NOTHING_USABLE, 0, 1, 0.0, np.nan, "True", np.array([True])]
@@ -142,9 +140,6 @@ REFUSED = {
         "horizon": [*POSITIVE_COUNTS, 100_001],
     },
     vector: {
-        **dict.fromkeys(("channel", "task", "contract", "initial_set"), NOT_PARTS),
-        "plant": [*WRONG, Channel, 3],
-        "disturbance": NOT_DISTURBANCES,
         "num_envs": [*POSITIVE_COUNTS, None],
         "max_episode_steps": POSITIVE_COUNTS,
         **dict.fromkeys(("autoreset_mode", "render_mode"), WRONG),
@@ -187,18 +182,3 @@ def test_wrong_values_of_a_setting_are_refused_in_one_sentence(make, name, wrong
         what = f"value {number}, of type {type(value).__name__}"
         text = assert_refused(lambda value=value: make(**{name: value}), what)
         assert name in text or NAMED.get(name, name) in text, (what, text)
-
-
-@given(data=st.data())
-@examples(40)
-def test_matrices_with_one_wrong_entry_are_refused(data):
-    make, name = data.draw(
-        st.sampled_from([(equations, "A"), (equations, "B"), (equations, "H"), (gaussian, "covariance")])
-    )
-    array = np.eye(2)[:, :1] + 1.0 if name == "B" else np.eye(2)
-    entry = data.draw(st.sampled_from(range(array.size)))
-    array.flat[entry] = data.draw(st.sampled_from([np.nan, np.inf, -np.inf, 1e75, -1e300]))
-    assert_refused(lambda: make(**{name: array}))
-    texts = array.astype(object)
-    texts.flat[entry] = data.draw(st.sampled_from(["1", None, 1j, [1.0], 10**400]))
-    assert_refused(lambda: make(**{name: texts}))

@@ -13,7 +13,8 @@ from tests.product import loop_env, safety_shield, vector_env, vector_shield
 CHANNEL = Channel(0.3, quantization_step=0.05, send_period=2, delay=1, jitter=1)
 STARTS = [[0.0, 0.0], [0.3, -0.1], [5.0, 5.0]]
 BAD_ACTIONS = [*NOTHING_USABLE, np.nan, [np.nan], [np.inf], [0.0, 0.0], [[0.0]], None, 0.5, np.zeros(0), {"u": 1.0}]
-BAD_OPTIONS = [{"state": [np.nan, 0.0]}, {"state": [1.0]}, {"start": [0.0, 0.0]}, 3]
+BAD_OPTIONS = [{"state": [np.nan, 0.0]}, {"state": [1.0]}, {"start": [0.0, 0.0]}, {1: 2}, 3, {"channel": 0.3}]
+BAD_OPTIONS += [{"channel": Channel(quantization_step=0.1)}, {"downlink": Channel()}]
 MOVES = st.lists(
     st.tuples(st.just("step"), st.floats(-3.0, 3.0))
     | st.tuples(st.just("bad step"), st.sampled_from(BAD_ACTIONS))
@@ -47,18 +48,14 @@ def played(env, moves, count=None):
             with pytest.raises(ValueError, match=r"must be finite with shape"):
                 env.step(value)
         else:
-            with pytest.raises(ValueError, match=r"option"):
+            with pytest.raises(ValueError, match=r"option|channel|downlink"):
                 env.reset(options=value)
     return [flat(each) for each in returned]
 
 
 def pair(kind, certificate, loaded):
     """Two equal loops of a kind, and how many environments each has."""
-    settings = {
-        "plant": loaded,
-        "channel": CHANNEL,
-        "disturbance": "sphere",
-    }
+    settings = {"plant": loaded, "channel": CHANNEL, "disturbance": "sphere"}
     if kind == "scalar":
         return [loop_env(**settings) for _ in range(2)], None
     if kind == "shield":

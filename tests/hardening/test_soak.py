@@ -3,11 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from ncs_gym import Channel, NCSEnv
-from ncs_gym.estimation import arrival_histories
-from ncs_gym.estimation.arrival_histories import ArrivalHistories
 from tests.product import loop_env, vector_env
 
 EPISODE = 300
@@ -36,35 +33,6 @@ def growth(env, steps, warm_up):
     return resident() - before
 
 
-def many(plant, count):
-    return vector_env(count, plant=plant, channel=CHANNEL, max_episode_steps=EPISODE)
-
-
-@pytest.fixture
-def forgotten(monkeypatch):
-    """Graphs of histories that were forgotten but for those in use; they are forgotten when there are few."""
-    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 300)
-    graphs, keeping = [], ArrivalHistories.keeping
-
-    def counted(graph, histories):
-        graphs.append(len(graph))
-        return keeping(graph, histories)
-
-    monkeypatch.setattr(ArrivalHistories, "keeping", counted)
-    return graphs
-
-
 def test_a_long_run_does_not_grow(loaded):
-    assert growth(many(loaded, 32), 650, 400) < MOST_GROWTH
+    assert growth(vector_env(32, plant=loaded, channel=CHANNEL, max_episode_steps=EPISODE), 650, 400) < MOST_GROWTH
     assert growth(loop_env(loaded, CHANNEL), 1200, 600) < MOST_GROWTH
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [1, 256])
-def test_a_million_steps_with_forgetting_do_not_grow(size, loaded, forgotten, monkeypatch):
-    monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 4000)
-    # Where many samples are late, histories hardly recur: the graph is full again and again.
-    settings = {"plant": loaded, "channel": Channel(0.5, jitter=4)}
-    env = loop_env(**settings) if size == 1 else vector_env(size, max_episode_steps=EPISODE, **settings)
-    assert growth(env, 1_000_000 // size, 400_000 // size) < MOST_GROWTH
-    assert len(forgotten) > 3

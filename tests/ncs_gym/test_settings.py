@@ -10,7 +10,6 @@ from ncs_gym import Channel, ChannelContract, NCSEnv
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.plants.library import batch_reactor
-from tests.product import loop_env
 
 ID = "ncs_gym/TruckTrailerCruise-v0"
 DOWNLINK = {"downlink": Channel(delay=1), "downlink_contract": ChannelContract(2)}
@@ -28,14 +27,6 @@ def test_settings_of_an_environment_and_its_state_are_not_set(make):
             setattr(inner, name, getattr(inner, name))
     inner.state[:] = 7.0  # a copy
     np.testing.assert_array_equal(inner.state, before)
-
-
-@pytest.mark.parametrize("make", MAKES, ids=["one", "many"])
-def test_contract_of_the_downlink_is_the_one_given_or_what_its_settings_guarantee(make):
-    env = make().unwrapped
-    assert env.downlink_contract == ChannelContract(2)
-    assert loop_env(env.plant, downlink=Channel(delay=1)).downlink_contract == ChannelContract(1)
-    assert loop_env(env.plant).downlink_contract is None
 
 
 def test_what_estimators_share_cannot_be_written_to():

@@ -79,7 +79,6 @@ class ScriptedEnv(NCSEnv):
     """The scalar environment fed with what one environment of a vector drew."""
 
     def follow(self, many: NCSVectorEnv, index: int) -> None:
-        """Says which environment of which vector is followed."""
         self.many, self.index = many, index
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple:
@@ -110,7 +109,6 @@ class ScriptedEnv(NCSEnv):
         return self._observation(), info
 
     def step(self, action: np.ndarray) -> tuple:
-        """Steps with what the vector drew at its last step."""
         self.hear()
         result = super().step(action)
         sends = self._now.network.sends_at(self.steps)
@@ -122,7 +120,6 @@ class ScriptedEnv(NCSEnv):
         self._now.state = state.copy()
 
     def hear(self) -> None:
-        """Takes over what the vector drew at its last step."""
         process, rng = self.many._now.process, self.many.np_random
         self._now.process.disturbance_now = process.disturbance_now[:, self.index]
         self._now.process.noise_now = process.noise_now[:, self.index]
@@ -175,7 +172,6 @@ class LoopBeside:
         self.shield, self.loops, self.packets = shield, {}, []
 
     def start(self, info: dict[str, Any]) -> None:
-        """Begins an episode that the shield has begun."""
         env, channel = self.shield.unwrapped, self.shield.unwrapped.episode_channel
         if channel not in self.loops:
             behind = {"downlink": env.downlink, "downlink_contract": env.downlink_contract, "on_unproved": "ignore"}
@@ -196,11 +192,9 @@ class LoopBeside:
         self.assert_same(info)
 
     def pickle(self) -> None:
-        """Goes on as a loop that was pickled and loaded."""
         self.loop = self.loops[self.loop.channel] = pickle.loads(pickle.dumps(self.loop))
 
     def decide(self, action: np.ndarray, *, ask: bool) -> None:
-        """Decides about the action that the shield is about to be given."""
         plant = self.loop.filter.plant
         self.decision = self.loop.decide(
             plant.input_middle + plant.input_half * np.asarray(action, np.float64), ask=ask
@@ -219,7 +213,6 @@ class LoopBeside:
         self.assert_same(info)
 
     def assert_same(self, info: dict[str, Any]) -> None:
-        """Compares what is known and what is proved."""
         arrays.assert_close(self.loop.estimate, info["estimate"], rtol=1e-9, atol=1e-12)
         arrays.assert_close(self.loop.error_shape, info["error_shape"], rtol=1e-9, atol=1e-15)
         assert (self.loop.measurement_age, self.loop.steps) == (info["measurement_age"], self.shield.unwrapped.steps)
@@ -232,8 +225,6 @@ class LoopBeside:
 
 @dataclass
 class Seen:
-    """What happened in a comparison."""
-
     alarms: int = 0
     interventions: int = 0
     plans: int = 0
@@ -242,7 +233,6 @@ class Seen:
     reasons: set[str] = field(default_factory=set)
 
     def note(self, infos: dict[str, Any]) -> None:
-        """Counts what the infos of a vector say."""
         self.alarms += int(infos["assumption_violated"].sum())
         self.broken += int(infos["contract_broken"].sum())
         self.interventions += int(np.sum(infos.get("shield_intervened", 0)))
@@ -261,15 +251,8 @@ def compare(
 ) -> Seen:
     """Steps a vector and, with the same draws, scalar environments; compares everything that both say.
 
-    With a certificate all are shielded, and a loop without Gymnasium runs beside each scalar shield.
-
-    Args:
-        many: The vector environment.
-        steps: How many steps.
-        options: Of the first reset.
-        certificate: That of the shields; None compares bare environments.
-        mode: Of the shields.
-        anew: Before which steps every third environment is reset alone.
+    With a certificate all are shielded, and a loop without Gymnasium runs beside each scalar shield. The options are of
+    the first reset; before the steps in `anew` every third environment is reset alone.
     """
     shielded = certificate is not None
     settings = {"mode": mode, "penalty": 0.25, "on_unproved": "ignore"}

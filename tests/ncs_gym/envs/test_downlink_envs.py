@@ -4,8 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Actuator, Channel, ChannelContract, GilbertElliott, SpeedTracking, truck_trailer
-from ncs_gym.network.downlink import Command
+from ncs_gym import Channel, ChannelContract, GilbertElliott, SpeedTracking, truck_trailer
 from tests.ncs_gym.envs.same_draws import compare
 from tests.product import loop_env, vector_env
 
@@ -98,12 +97,3 @@ def test_a_contract_that_the_downlink_may_break_is_kept_until_it_does():
     env.reset(seed=0)
     broken = [env.step(np.ones(1))[4]["downlink_broken"] for _ in range(200)]
     assert 5 < sum(broken) < 60  # three losses in a row: an eighth of the steps
-
-
-def test_plain_tuples_and_whole_numbers_of_numpy_are_commands():
-    actuator = Actuator(input_delay=2, inputs=1)
-    actuator.receive([Command(stamp=0, inputs=np.array([[1.0], [2.0], [3.0]]))])
-    sent = np.array([[4.0], [5.0], [6.0]])
-    actuator.receive(iter([(np.int64(1), sent)]))
-    sent[:] = 9.0
-    np.testing.assert_array_equal(actuator.apply(np.int64(3)), [6.0])

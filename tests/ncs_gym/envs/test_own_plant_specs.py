@@ -24,7 +24,6 @@ from ncs_gym import (
     SpeedTracking,
     TraceChannel,
 )
-from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_pole
 from ncs_gym.processes.process import LinearProcess
 from ncs_gym.registration import registered_ids
 from ncs_gym.uncertainty.disturbances import BallDisturbance, SphereDisturbance
@@ -37,19 +36,16 @@ TRUCK = "ncs_gym/TruckTrailer-v0"
 BURSTS = GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.5)
 SETTINGS = [
     {},
-    {"channel": Channel(loss=BURSTS, delay=1)},
-    {"channel": Channel(loss=0.1, quantization_step=0.01, delay=1, jitter=2, max_consecutive_losses=3)},
+    {"channel": Channel(loss=BURSTS, quantization_step=0.01, delay=1, jitter=2, max_consecutive_losses=3)},
     {"channel": TraceChannel(trace=(0, 1, -1, 2))},
     {"channel": Channel(max_consecutive_losses=1), "contract": ChannelContract(max_age=5)},
     {"channel": Channel(max_consecutive_losses=1), "downlink": Channel(delay=1, max_consecutive_losses=1)},
     {"task": SetpointTracking(output=np.array([1.0, 0.0]), reach=0.1, width=1.0)},
     {"task": Regulation(state_cost=np.eye(2), input_cost=[[0.5]])},
     {"disturbance": BallDisturbance()},
-    {"disturbance": BoxDisturbance()},
     {"disturbance": BoxDisturbance(np.array([0.001, 0.002]))},
     {"disturbance": SinusoidDisturbance(period=7.0)},
     {"disturbance": SphereDisturbance()},
-    {"disturbance": AdversarialDisturbance()},
     {"disturbance": AdversarialDisturbance(M=np.diag([1.0, 2.0]))},
     {"disturbance": AdversarialDisturbance(rows=np.array([[1.0, -1.0]]))},
     {"initial_set": Ellipsoid(np.diag([0.01, 0.02]))},
@@ -58,18 +54,12 @@ SETTINGS = [
 ]
 # Of a registered plant, which is no part of the spec; some are JSON values already.
 OF_TRUCKS = [
-    {"channel": {"loss": {"p_good_to_bad": 0.1, "p_bad_to_good": 0.5}, "delay": 3}},
     {"channel": {"loss": 0.2, "max_consecutive_losses": 1, "on_request": True}, "contract": {"max_age": 6}},
+    {"channel": {"loss": {"p_good_to_bad": 0.1, "p_bad_to_good": 0.5}, "delay": 3}, "noise": "gaussian"},
     {"downlink": Channel(loss=BURSTS, delay=1, max_consecutive_losses=3), "downlink_contract": ChannelContract(5)},
-    {"noise": "gaussian"},
-    {"contract": {"max_age": 5}, "channel": {}},
-    {"task": SpeedTracking(fastest=10.0)},
-    {"task": {"output": [1.0, 0.0], "reach": 0.8, "width": 0.5}},
-    {"disturbance": "sphere"},
-    {"disturbance": {"half_widths": [0.01, 0.01]}},
-    {"disturbance": {"period": 7.0}},
-    {"initial_set": {"shape_matrix": [[1.0, 0.0], [0.0, 2.0]]}},
-    {"terminate_on_violation": True, "allow_assumption_violation": True},
+    {"task": {"output": [1.0, 0.0], "reach": 0.8, "width": 0.5}, "disturbance": "sphere"},
+    {"task": SpeedTracking(fastest=10.0), "disturbance": {"half_widths": [0.01, 0.01]}},
+    {"initial_set": {"shape_matrix": [[1.0, 0.0], [0.0, 2.0]]}, "allow_assumption_violation": True},
 ]
 
 
@@ -115,7 +105,7 @@ def assert_moves_alike(one, other):
         np.testing.assert_array_equal(reward, same_reward)
 
 
-@pytest.mark.cases(14)
+@pytest.mark.cases(12)
 @pytest.mark.parametrize(
     ("env_id", "settings"), [(LINEAR, each) for each in SETTINGS] + [(TRUCK, each) for each in OF_TRUCKS]
 )
@@ -135,9 +125,8 @@ def test_loaded_spec_makes_the_same_environment_again(env_id, settings):
     assert vector.channel == made.unwrapped.channel
 
 
-@pytest.mark.cases(4)
-@pytest.mark.parametrize("settings", SETTINGS, ids=str)
-def test_spec_of_a_registered_plant_is_json(settings, register):
+def test_spec_of_a_registered_plant_is_json(register):
+    settings = {"channel": Channel(loss=BURSTS, delay=1), "disturbance": AdversarialDisturbance(M=np.diag([1.0, 2.0]))}
     register("Plants/Own-v0", own_plant(), max_episode_steps=20, **settings)
     spec = gym.spec("Plants/Own-v0")
     for twin in (EnvSpec.from_json(spec.to_json()), pickle.loads(pickle.dumps(spec)), copy.deepcopy(spec)):
@@ -147,23 +136,12 @@ def test_spec_of_a_registered_plant_is_json(settings, register):
 
 def test_spec_of_a_vector_environment_is_json(register):
     register("Plants/Own-v0", own_plant())
-    for made in (
-        gym.make_vec(LINEAR, num_envs=2, plant=own_plant(), channel=Channel(loss=BURSTS, delay=1)),
-        gym.make_vec("Plants/Own-v0", num_envs=2),
-    ):
+    own = gym.make_vec(LINEAR, num_envs=2, plant=own_plant(), channel=Channel(loss=BURSTS, delay=1))
+    for made in (own, gym.make_vec("Plants/Own-v0", num_envs=2)):
         again = gym.make_vec(EnvSpec.from_json(made.spec.to_json()))
         assert isinstance(again, NCSVectorEnv)
         assert again.episode_channels == made.episode_channels
         assert_moves_alike(made, again)
-
-
-def test_process_of_a_plant_of_ones_own_is_json():
-    kwargs = {"plant": nonlinear_cart_pole(), "process": CartPoleProcess(pole_mass=0.11)}
-    channel = Channel(max_consecutive_losses=1)
-    made = gym.make(LINEAR, channel=channel, **kwargs)
-    again = gym.make(EnvSpec.from_json(made.spec.to_json()))
-    assert again.unwrapped.process == made.unwrapped.process
-    assert_moves_alike(made, again)
 
 
 def test_environments_of_one_document_share_the_plant():
@@ -184,25 +162,10 @@ def test_shielded_and_randomized_environment_is_made_again_from_its_spec(registe
     assert_moves_alike(made, again)
 
 
-@pytest.mark.parametrize("limits", [{"box": [5.0, np.inf]}, {"box": [[0.2, 0.0], [0.4, 0.0]]}, {"box": [[1.0, -1.0]]}])
-def test_states_without_a_limit_start_at_the_operating_point(limits):
-    plant = linear_plant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=1.0, gamma=1e-4, **limits)
+@pytest.mark.parametrize("box", [[5.0, np.inf], [[1.0, -1.0]]])
+def test_states_without_a_limit_start_at_the_operating_point(box):
+    plant = linear_plant(A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.1]], dt=1.0, u_max=1.0, gamma=1e-4, box=box)
     env, free = gym.make(LINEAR, plant=plant), np.linalg.svd(plant.box)[2][-1]
     starts = np.array([env.reset(seed=seed)[1]["state"] for seed in range(50)])
     np.testing.assert_allclose(starts @ free, 0.0, atol=1e-12)
     assert 0.05 < np.abs(starts @ plant.box.T).max() <= 0.1 + 1e-9
-
-
-def test_past_inputs_cost_nothing_but_what_inputs_do():
-    settings = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 1.0, "box": 1.0, "u_max": 1.0, "gamma": 0.0}
-    quiet = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.0)
-    plain, limited = (linear_plant(**settings, **quiet, **each) for each in ({}, {"du_max": 1.9}))
-    returns = []
-    for plant in (plain, limited):
-        env, total = gym.make(LINEAR, plant=plant, channel=Channel()), 0.0
-        env.reset(seed=0, options={"state": np.zeros(plant.n)})
-        for step in range(30):
-            total += env.step(np.float32([0.5 * np.sin(step)]))[1]
-        returns.append(total)
-    assert returns[0] < -0.01
-    assert returns[1] == pytest.approx(returns[0], rel=1e-6)

@@ -21,13 +21,7 @@ class Prior(NamedTuple):
 
 
 class PlainEstimator:
-    """What `Estimator` does, as a history of `Prior`s by step: no numbers, no graph, nothing shared or remembered.
-
-    Args:
-        plant: The plant.
-        channel: Gives the longest delay.
-        recursion: Moves the statistics.
-    """
+    """What `Estimator` does, as a history of `Prior`s by step: no numbers, no graph, nothing shared or remembered."""
 
     def __init__(self, plant: LinearPlant, channel: Channel, recursion: ErrorRecursion) -> None:
         self.plant, self.buffer, self.recursion = plant, channel.longest_delay, recursion

@@ -43,8 +43,8 @@ def test_set_covers_a_bad_first_estimate_and_leaves_slack_in_every_direction(pla
     assert np.linalg.eigvalsh(errors.Sigma - grown)[0] > 0.0
 
 
-@pytest.mark.cases(8)
-@pytest.mark.parametrize("n", [4, 10, 12])
+@pytest.mark.cases(4)
+@pytest.mark.parametrize("n", [4, 12])
 @pytest.mark.parametrize("radius", [0.5, 0.99, 0.9999])
 @pytest.mark.parametrize("seed", range(3))
 def test_strongly_coupled_plants_get_a_true_set_or_an_error(seed, radius, n):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ncs_gym import Channel, ChannelContract, ErrorSetError, GilbertElliott, Packet, cart_pole, truck_trailer
+from ncs_gym import Channel, ChannelContract, ErrorSetError, Packet, cart_pole, truck_trailer
 from ncs_gym.estimation import arrival_histories
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.error_bound import certified_error_set
@@ -20,9 +20,6 @@ from ncs_gym.plants.library import batch_reactor
 from tests import arrays
 from tests.fuzz import channels, examples, plants
 from tests.ncs_gym.estimation.plain_estimator import PlainEstimator
-from tests.product import library_plant
-
-BURSTS = GilbertElliott(p_good_to_bad=0.15, p_bad_to_good=0.3, loss_good=0.05, loss_bad=0.9)
 
 
 def attacked(rng, packets, sent, step, plant):
@@ -114,18 +111,13 @@ def test_estimator_equals_the_plain_one_bit_for_bit(of, age, count):
 
 CASES = {
     "overtaking": (truck_trailer(mass=4000.0), Channel(loss=0.2, quantization_step=0.02, delay=1, jitter=4), None),
-    "position only": (library_plant(truck_trailer, H=[[1.0, 0.0]]), Channel(loss=BURSTS, jitter=3), None),
-    "cart-pole": (cart_pole(), Channel(loss=0.5, max_consecutive_losses=2, jitter=2), ChannelContract(4)),
     "broken": (batch_reactor(), Channel(loss=0.5, jitter=3), ChannelContract(3)),
     "one output": (cart_pole(full_state=False), Channel(loss=0.2, delay=1, jitter=1), ChannelContract(3)),
-    "stable with a contract": (truck_trailer(), Channel(loss=0.4, delay=1, jitter=3), ChannelContract(5)),
 }
-QUICK = ("overtaking", "broken", "one output")  # the others say the same of other plants and channels
-EVERY = [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in CASES]
 
 
 @pytest.mark.cases(1)
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", CASES)
 def test_estimator_equals_the_plain_one_for_long_also_where_it_forgets_in_the_middle_of_an_episode(name, monkeypatch):
     monkeypatch.setattr(arrival_histories, "MAX_HISTORIES", 30)
     forgotten, keeping = [], arrival_histories.ArrivalHistories.keeping

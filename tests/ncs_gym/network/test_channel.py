@@ -48,7 +48,7 @@ def test_loss_alone_may_be_given_without_its_name():
 
 def test_gilbert_elliott_loses_in_bursts_at_its_stationary_rate():
     loss = GilbertElliott(p_good_to_bad=0.05, p_bad_to_good=0.2)
-    arrivals = transmit(Channel(loss=loss), 60_000)
+    arrivals = transmit(Channel(loss=loss), 40_000)
     lost = np.array([not stamps for stamps in arrivals.values()])
     assert lost.mean() == pytest.approx(0.2, abs=0.015)
     ends = np.flatnonzero(np.diff(lost.astype(int)) == -1)
@@ -57,12 +57,12 @@ def test_gilbert_elliott_loses_in_bursts_at_its_stationary_rate():
     assert np.mean(bursts) == pytest.approx(5.0, rel=0.1)  # 1 / p_bad_to_good
 
 
-@pytest.mark.cases(10)
-@pytest.mark.parametrize("most", [None, 0, 1, 3, 40])
+@pytest.mark.cases(5)
+@pytest.mark.parametrize("most", [None, 1, 40])
 @pytest.mark.parametrize(
     ("loss", "period"),
     [
-        *((0.6, 1), (1.0, 1), (0.9, 2), (BURSTS, 1), (BURSTS, 3)),
+        *((1.0, 1), (0.9, 2), (BURSTS, 3)),
         (GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.0), 1),
         (GilbertElliott(p_good_to_bad=0.1, p_bad_to_good=0.3, loss_good=0.2, loss_bad=0.7), 1),
     ],
@@ -91,14 +91,6 @@ def test_quantizer_rounds_to_multiples_within_half_a_step():
     assert np.abs(rounded - values).max() <= 0.025 * (1 + 1e-12)
     np.testing.assert_allclose(rounded / 0.05, np.round(rounded / 0.05), atol=1e-9)
     assert len(np.unique(rounded)) < 125
-
-
-def test_all_impairments_work_together():
-    channel = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2, jitter=2)
-    arrivals = transmit(channel, 6000)
-    pairs = [(step, stamp) for step, stamps in arrivals.items() for stamp in stamps]
-    assert all(stamp % 2 == 0 and 2 <= step - stamp <= 4 for step, stamp in pairs)
-    assert len(pairs) / 3000 == pytest.approx(0.7, abs=0.04)
 
 
 def test_random_draws_do_not_depend_on_the_measurement():

@@ -56,7 +56,7 @@ def test_channel_keeps_the_contract_derived_from_it_and_no_better_one(channel):
     # By another route: the newest sample that has arrived, counted packet by packet.
     contract, rng = contract_of(channel), np.random.default_rng(0)
     link, newest, oldest = ChannelState(channel, rng), 0, 0
-    for step in range(1, 5_000):
+    for step in range(1, 2_000):
         sample = np.zeros(1) if link.sends_at(step) else None
         newest = max([newest, *(packet.stamp for packet in link.exchange(rng, step, sample))])
         oldest = max(oldest, step - newest)
@@ -130,69 +130,23 @@ def test_update_falls_back_to_the_certified_gain_and_never_skips(monkeypatch):
     assert used > 25
 
 
-@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
-def test_registered_channels_keep_their_contracts(env_id):
-    env = gym.make(env_id).unwrapped
-    assert env.contract.is_kept_by(env.channel)
-    assert env.plant.spectral_radius > 1.0
-    assert env.terminate_on_violation
-    _, info = env.reset(seed=0)
-    ages = []
-    for _ in range(300):
-        *_, terminated, _, info = env.step(np.zeros(env.plant.m))
-        ages.append(info["measurement_age"])
-        assert not info["contract_broken"]
-        if terminated:
-            env.reset()
-    assert max(ages) == env.contract.max_age
-
-
-@pytest.mark.parametrize("env_id", ["ncs_gym/CartPole-v0", "ncs_gym/BatchReactor-v0"])
-def test_breaking_the_contract_is_reported_when_it_happens(env_id):
-    whole = gym.make(env_id).unwrapped.channel
-    env = gym.make(env_id, channel=replace(whole, max_consecutive_losses=None, loss=1.0)).unwrapped
+def test_breaking_the_contract_is_reported_when_it_happens():
+    whole = gym.make("ncs_gym/CartPole-v0").unwrapped.channel
+    env = gym.make("ncs_gym/CartPole-v0", channel=replace(whole, max_consecutive_losses=None, loss=1.0)).unwrapped
     env.reset(seed=0)
     for step in range(1, 12):
         info = env.step(np.zeros(env.plant.m))[4]
         assert info["contract_broken"] is (step > env.contract.max_age)
 
 
-def test_one_step_beyond_the_contract_the_error_can_leave_the_certified_set():
-    for plant, contract in PLANTS.values():
-        if plant.spectral_radius < 1.0:
-            continue
-        sets = certified_error_set(plant, contract)
-        M, errors = np.linalg.inv(sets.Sigma), Ellipsoid(sets.Sigma)
-        worst = 0.0
-        for seed in range(20):
-            slope = np.random.default_rng(seed).standard_normal(plant.n)
-            for _ in range(60):
-                e, d = errors.extreme_point(plant.A.T @ slope), plant.disturbance.extreme_point(slope)
-                slope = M @ (plant.A @ e + d)
-            worst = max(worst, errors.gauge(plant.A @ e + d))
-        assert worst > 1.01
-
-
-@pytest.mark.parametrize("outage", [150, pytest.param(1500, marks=pytest.mark.slow)])
-def test_long_outages_end_no_episode_with_an_exception(outage):
-    twice = linear_plant(
-        A=[[1.2]],
-        B=[[1.0]],
-        box=[[1.0]],
-        H=[[1.0], [1.0]],
-        u_max=1.0,
-        dt=0.1,
-        gamma=1e-4,
-        measurement_noise_cov=1e-6 * np.eye(2),
-    )
-    for plant in (twice, batch_reactor(), cart_pole()):
-        contract = ChannelContract(2)
-        estimator = Estimator(plant, Channel(), certified_error_set(plant, contract))
-        estimator.reset(np.zeros(plant.n))
-        for step in range(1, outage + 50):
-            packets = [] if step < outage else [Packet(step, np.zeros(plant.p))]
-            estimator.advance(np.zeros(plant.m), packets)
-        assert np.isfinite(estimator.mean).all()
+def test_a_long_outage_ends_no_episode_with_an_exception():
+    settings = {"u_max": 1.0, "dt": 0.1, "gamma": 1e-4, "measurement_noise_cov": 1e-6 * np.eye(2)}
+    plant = linear_plant(A=[[1.2]], B=[[1.0]], box=[[1.0]], H=[[1.0], [1.0]], **settings)
+    estimator = Estimator(plant, Channel(), certified_error_set(plant, ChannelContract(2)))
+    estimator.reset(np.zeros(1))
+    for step in range(1, 160):
+        estimator.advance(np.zeros(1), [] if step < 150 else [Packet(step, np.zeros(2))])
+    assert np.isfinite(estimator.mean).all()
 
 
 def test_prediction_falls_back_to_the_certified_set(monkeypatch):

@@ -96,11 +96,6 @@ KINDS = {
         times("0.02", ["0.012", None, None, "0.039", "0.015"]),
         "0.02",
     ),
-    "table of times since 1970": Kind(
-        "sent,received\n1700000000.00,1700000000.011\n1700000000.02,\n1700000000.04,1700000000.09\n",
-        times("0.02", ["0.011", None, "0.05"]),
-        "0.02",
-    ),
     "table with several packets in a step, and a clock before 0": Kind(
         "sent,received\n-0.007,0.023\n0,0.001\n0.007,\n0.014,\n0.021,0.022\n0.042,0.053\n0.049,0.05\n0.07,0.071\n",
         [
@@ -108,11 +103,6 @@ KINDS = {
             *(("0.042", "0.053"), ("0.049", "0.05"), ("0.07", "0.071")),
         ],
         "0.02",
-    ),
-    "ping with packets that are lost at both ends": Kind(
-        run([(3, "0.1", "0.0123"), (4, "0.15", "0.080"), (6, "0.25", "0.012")], 9),
-        times("0.05", [None, None, "0.0123", "0.08", None, "0.012", None, None, None]),
-        "0.05",
     ),
     "ping with a late answer, duplicates, and lines of what was not answered": Kind(
         ended(
@@ -140,15 +130,6 @@ KINDS = {
         .replace("\n", "\r\n"),
         times("1", ["0.012", "0.15"]),
         "0.05",
-    ),
-    "ping from an interface, with a pause and no packet on a multiple of the step": Kind(
-        run(
-            [(n, sent, "0.012") for n, sent in enumerate(("0", "0.05", "0.1", "7.4", "7.45", "7.50", "7.55"), 1)],
-            7,
-            header="PING 192.0.2.1 (192.0.2.1) from 192.0.2.7 wlan0: 56(84) bytes of data.\n",
-        ),
-        [(s, Fraction(s) + Fraction("0.012")) for s in ("0", "0.05", "0.1", "7.4", "7.45", "7.5", "7.55")],
-        "0.07",
     ),
 }
 
@@ -202,29 +183,18 @@ RUN = [(n, n, "0.01") for n in range(1, 6)]
 LINES, PING = "".join(reply(*each) for each in RUN), run(RUN, 5)
 WHOLE = "ends with the statistics of one run in English, which say how many"
 BACK = [(n, n if n < 18 else n - 2, "0.01") for n in range(1, 40) if not 18 <= n < 22]
-# What was once guessed: answers of another host, rows of several senders, arrivals as round trips and the reverse,
-# milliseconds under names of one's own, dates as stamps, and a failure to send as another run.
+# What was once guessed: answers of another host, rows of several senders, dates as stamps, a failure to send.
 REFUSED = [
     (PING.replace(f"{HOST}: icmp_seq=3", "10.0.0.99: icmp_seq=3"), "line 4 is an answer of another host, '10.0.0.99'"),
-    (PING.replace("ms\n", "ms (DIFFERENT ADDRESS!)\n", 1), "line 2 is none of Linux ping -D in English"),
     ("sent,received,can_id\n0,0.1,1\n1,1.1,2\n2,2.1,1\n", "are ['sent', 'received', 'can_id']"),
     ("sent,received\n0,0.01\n1,0.01\n", "packet 2 arrived before it was sent: the clocks"),
-    ("pub_time(ms) sub_time(ms) delay(ms)\n0 5 5\n20 25 5\n", "are ['pub_time(ms) sub_time(ms) delay(ms)']"),
     (PING.replace(at("2.01"), "[2024-05-27 12:04:44.268336] "), "line 3 is none of Linux ping -D in English, '[2024-"),
-    ("\r\nPinging 192.0.2.1 with 32 bytes of data:\r\nPING: transmit failed. General failure.\r\n", "are []"),
     (ended(LINES + "PING: transmit failed. General failure.\n", 6), "line 7 is none of Linux ping -D in English"),
     # Other runs, other programs, and lines that are missing.
-    ("64 bytes from 192.0.2.1: icmp_seq=1 ttl=64 time=1 ms\n", "are ['64 bytes from 192.0.2.1: icmp_seq=1"),
     (run(RUN, 5, header="PING host (192.0.2.1): 56 data bytes\n"), "line 1 is not what Linux ping begins with"),
     (2 * PING, WHOLE),
-    (LINUX + LINES, WHOLE),
     (run(RUN, 5, more=", +1 corrupted"), WHOLE),
-    (
-        run([*RUN, *((n, s + 9, d) for n, s, d in RUN)], 5),
-        "its numbers do not count packets: a pause is too long, or it",
-    ),
     (run([*RUN, (6, 30_000, "0.01")], 99_999), "its numbers do not count packets: a pause is too long, or it has"),
-    (run(RUN, 4), "its statistics have 4 packets and 5 answers, its lines 5 and 5: lines are missing"),
     (PING.replace(reply(*RUN[2]), ""), "its statistics have 5 packets and 5 answers, its lines 5 and 4: lines"),
     (run(RUN[:1], 5), "at least two packets that were answered"),
     (run([(n, 0, "0.01") for n in range(1, 5)], 4), "its packets were not sent one after the other"),
@@ -234,18 +204,11 @@ REFUSED = [
     (run(BACK, 39), "between the packets 17 and 22 its stamps leave too little time for the lost ones"),
     ("sent,received\n0,1\n5,\n3,4\n", "packet 3 was sent before the one above: sort the rows by sent"),
     # Tables.
-    ("0.0,0.1\n0.2,0.3\n", "are ['0.0', '0.1']"),
-    ("sent;received\n0;1\n1;2\n", "are ['sent;received']"),
     (codecs.BOM_UTF16_LE + "sent,received\n0,1\n".encode("utf-16-le"), "it is no text in UTF-8"),
     ("sent,received\n0,02,0,03\n", "line 2 has not 2 cells"),
-    ("sent,received\n2026-01-01T10:00:00,\n", "line 2: '2026-01-01T10:00:00' is no number"),
     ("sent,received\n0,nan\n1,2\n", "line 2: 'nan' is no number"),
     ('sent,received\n0,"1\n', "line 2 is not of a CSV file"),
     ("sent,received\n0,1\n,2\n", "packet 2 has no time of sending"),
-    (
-        "sent,received\n1700000000000,1700000000012\n1700000000001,\n",
-        "packet 1 has times that are too large for seconds",
-    ),
     ("sent,received\n0,1\n1,1e999\n", "packet 2 has times that are too large for seconds"),
     ("sent,received\n0,1\n", "at least two packets"),
     ("sent,received\n0,1\n0,2\n", "one after the other"),
@@ -257,13 +220,9 @@ def test_file_that_is_not_certain_is_refused_in_one_sentence(content, words, wri
     with pytest.raises(ValueError, match=re.escape(words)) as refusal:
         PacketLog.load(written(content))
     assert "\n" not in str(refusal.value)
-    assert len(str(refusal.value)) < 600
-    if words.startswith("are [") or "none of Linux" in words or "another host" in words:
-        assert "a table with the columns sent and received alone, in seconds" in str(refusal.value)
-        assert 'others are in the documentation under "Contracts and recorded networks"' in str(refusal.value)
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     name=st.sampled_from(sorted(KINDS)),
     edits=st.lists(st.tuples(st.integers(0, 10**6), st.binary(max_size=4)), min_size=1, max_size=6),
@@ -292,29 +251,22 @@ def test_replay_in_an_environment_has_the_ages_of_the_record(record):
     sent = np.cumsum([0, *(gap for gap, _ in record[1:])]) / 4  # in quarters of a step
     received = [None if delay is None else start + delay / 4 for start, (_, delay) in zip(sent, record, strict=True)]
     log = PacketLog(sent, np.array([np.nan if r is None else r - s for s, r in zip(sent, received, strict=True)]))
-    ages, trace = log.ages(1.0), log.trace(1.0)
+    ages = log.ages(1.0)
     assert ages.tolist() == ages_by_clock(list(zip(sent, received, strict=True)), "1")
     promised = contract_of(log.channel(1.0))
     assert promised is None or ages.max() <= promised.max_age
-    env = loop_env(PLANT, channel=log.channel(1.0), terminate_on_violation=False)
-    replayed = set()
-    for seed in range(200):  # the replay begins with a random sample
-        env.reset(seed=seed)
-        replayed.add(tuple(env.step(np.zeros(1))[4]["measurement_age"] for _ in range(len(ages) - 1)))
-        if tuple(ages[1:].tolist()) in replayed:
-            break
-    assert tuple(ages[1:].tolist()) in replayed
-    assert len(replayed) <= len(trace)
+    env, replayed = loop_env(PLANT, channel=log.channel(1.0), terminate_on_violation=False), ()
+    seeds = iter(range(200))  # the replay begins with a random sample
+    while replayed != tuple(ages[1:].tolist()):
+        env.reset(seed=next(seeds))
+        replayed = tuple(env.step(np.zeros(1))[4]["measurement_age"] for _ in range(len(ages) - 1))
 
 
-@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     "answered",
     [
         [*range(1, 9), *range(32000, 32009), *range(65000, 65535), 65536, 65535, *range(65537, 65600)],  # a late answer
-        [*range(1, 9), *range(60000, 60009), *range(110000, 110009)],
         [*range(1, 9), 65544, 65545],  # the same number again
-        [65536, 65537],
     ],
 )
 def test_numbers_of_ping_go_on_after_16_bits(answered, written):
@@ -335,15 +287,6 @@ def test_stamp_that_was_printed_late_makes_no_packet_fresher(written):
     log = PacketLog.load(written(run(answers, 5)))
     assert log.sent[2] == log.sent[3]
     assert np.allclose(log.sent + log.delays, [float(moment) for moment, _ in lines])
-
-
-def test_packets_that_a_receiver_did_not_log_are_not_seen(written):
-    """Where the loop's sample was lost, the next packet of the step takes its place, if nobody says so."""
-    rows = [f"{n / 20},{'' if n % 4 == 2 else n / 20 + 0.01}\n" for n in range(41)]
-    both = PacketLog.load(written("sent,received\n" + "".join(rows)))
-    alone = PacketLog.load(written("sent,received\n" + "".join(row for row in rows if not row.endswith(",\n"))))
-    assert (both.ages(0.1).max(), alone.ages(0.1).max()) == (2, 1)
-    assert np.isnan(both.delays).sum() == 10
 
 
 def test_sample_that_is_later_than_any_channel_allows_counts_as_lost():

@@ -53,17 +53,16 @@ class Counter(gym.Env):
 
 
 class Sampled(gym.Env):
-    """Nothing moves: what is seen is drawn from a space, or is the one thing that is given.
+    """Nothing moves: what is seen is drawn from a space.
 
     Args:
         space: Of observations.
-        seen: What is observed after every step; drawn if it is None.
     """
 
     action_space = spaces.Discrete(2)
 
-    def __init__(self, space: spaces.Space[Any], seen: Any = None) -> None:
-        self.observation_space, self.seen, self.given = space, seen, []
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self.observation_space, self.given = space, []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
@@ -71,7 +70,7 @@ class Sampled(gym.Env):
         return self.given[0], {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.given.append(self.observation_space.sample() if self.seen is None else self.seen)
+        self.given.append(self.observation_space.sample())
         return self.given[-1], 0.0, False, False, {}
 
 

@@ -11,18 +11,11 @@ import torch
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
-from gymnasium.wrappers import DelayObservation, TimeLimit
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
-from ncs_gym import (
-    Channel,
-    GilbertElliott,
-    Networked,
-    RandomChannel,
-    TraceChannel,
-    VectorNetworked,
-)
+from ncs_gym import Channel, GilbertElliott, Networked, RandomChannel, TraceChannel, VectorNetworked
 from tests.ncs_gym.networked.environments import Counter, Sampled, ages_of_trace
 
 BURSTS = GilbertElliott(p_good_to_bad=0.2, p_bad_to_good=0.4)
@@ -60,18 +53,9 @@ def test_newest_sample_that_arrived_is_seen(trace):
     assert [each[-1]["packet_arrived"] for each in returned[1:]] == list(np.diff(counts(returned)) > 0)
 
 
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "FrozenLake-v1"])
-@pytest.mark.parametrize("channel", [None, Channel()])
+@pytest.mark.parametrize(("env_id", "channel"), [("CartPole-v1", Channel()), ("FrozenLake-v1", None)])
 def test_perfect_network_changes_nothing(env_id, channel):
-    bare, networked = (
-        gym.make(env_id),
-        Networked(
-            gym.make(env_id),
-            channel,
-            channel,
-            neutral=None if channel is None else 0 if env_id != "Pendulum-v1" else None,
-        ),
-    )
+    bare, networked = gym.make(env_id), Networked(gym.make(env_id), channel, channel, neutral=channel and 0)
     bare.action_space.seed(0)
     first, own = bare.reset(seed=0), networked.reset(seed=0)
     over = False
@@ -82,14 +66,6 @@ def test_perfect_network_changes_nothing(env_id, channel):
         action = bare.action_space.sample()
         first, own = bare.step(action), networked.step(action)
         over = first[2] or first[3]
-
-
-def test_delay_is_that_of_gymnasium():
-    ours, theirs = Networked(gym.make("Pendulum-v1"), Channel(delay=3)), DelayObservation(gym.make("Pendulum-v1"), 3)
-    ours.reset(seed=1), theirs.reset(seed=1)
-    for k in range(50):
-        seen, wanted = (env.step(np.array([np.sin(k)], np.float32))[0] for env in (ours, theirs))
-        assert k < 2 or np.array_equal(seen, wanted)  # before the first arrival: the start, and theirs zeros
 
 
 @pytest.mark.parametrize(
@@ -129,22 +105,6 @@ def test_what_is_seen_where_nothing_arrived():
     assert counts(run(Networked(Counter(), lost, fill=predicted), 7)) == [0, 1, 2, 3, 4, 5, 6, 7]
 
 
-@pytest.mark.parametrize("channel", [Channel(delay=3), Channel(delay=1, jitter=3, loss=0.3, send_period=2)])
-def test_exact_prediction_makes_up_for_delays(channel):
-    def predicted(last, age, actions):
-        return last + np.reshape(age, (-1, 1)) if np.ndim(age) else last + age
-
-    one = run(Networked(Counter(length=50), channel, fill=predicted, pending=40), 40)
-    assert counts(one) == list(range(41))
-    assert max(each[-1]["measurement_age"] for each in one) >= 3
-    envs = VectorNetworked(
-        gym.vector.SyncVectorEnv([lambda: Counter(length=50)] * 5), channel, fill=predicted, pending=40
-    )
-    assert (envs.reset(seed=0)[0] == 0).all()
-    for k in range(1, 41):
-        assert (envs.step(np.full((5, 1), k + 0.0))[0] == k).all()
-
-
 def test_entries_are_what_infos_say_and_actions_are_those_decided():
     env = Networked(gym.make("CartPole-v1"), LATE, LATE, ("age", "arrived", "pending_actions"), neutral=1, pending=3)
     assert env.observation_space.shape == (4 + 1 + 1 + 2 * 3,)
@@ -168,7 +128,7 @@ def test_entries_are_what_infos_say_and_actions_are_those_decided():
         (spaces.Box(-1.0, 1.0, (2,), np.float32), 2),
     ],
 )
-@pytest.mark.parametrize("kind", ["image", "dict", "vector"])
+@pytest.mark.parametrize("kind", ["image", "vector"])
 def test_entries_are_boxes_that_gymnasium_flattens_likewise_and_frames_can_be_stacked(kind, actions, size):
     class Acting(Counter):
         action_space = actions
@@ -176,19 +136,8 @@ def test_entries_are_boxes_that_gymnasium_flattens_likewise_and_frames_can_be_st
         def step(self, action):
             return super().step([0.0])
 
-    class OfPixels(Acting):
-        observation_space = spaces.Dict(image=spaces.Box(0, 255, (84, 84, 4), np.uint8))
-
-        def __init__(self):
-            super().__init__("image")
-            self.observation_space = OfPixels.observation_space
-
-        def _observation(self):
-            return {"image": super()._observation()}
-
     def make():
-        inner = OfPixels() if kind == "dict" else Acting(kind)
-        return Networked(inner, LATE, observe=("age", "arrived", "pending_actions"), pending=2)
+        return Networked(Acting(kind), LATE, observe=("age", "arrived", "pending_actions"), pending=2)
 
     env = make()
     env.action_space.seed(1)
@@ -215,7 +164,7 @@ def unstacked(observations):
     return {key: each[0] for key, each in observations.items()} if isinstance(observations, dict) else observations[0]
 
 
-@pytest.mark.parametrize("channel", [Channel(loss=0.3, delay=2, jitter=3), Channel(delay=3), Channel(delay=9)])
+@pytest.mark.parametrize("channel", [Channel(loss=0.3, delay=2, jitter=3), Channel(delay=9)])
 @pytest.mark.parametrize("kind", ["image", "buffers"])  # three buffers in turn
 def test_large_observations_are_what_they_were_when_they_were_taken(kind, channel):
     env = Networked(Counter(kind, length=99), channel)
@@ -235,8 +184,6 @@ def test_large_observations_are_what_they_were_when_they_were_taken(kind, channe
     [
         gym.spaces.Graph(gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Discrete(3)),
         gym.spaces.Tuple([gym.spaces.Text(5), gym.spaces.Discrete(2)]),
-        gym.spaces.Sequence(gym.spaces.Box(-1.0, 1.0, (2,))),
-        gym.spaces.OneOf([gym.spaces.Discrete(2), gym.spaces.Box(-1.0, 1.0, (2,))]),
     ],
 )
 def test_observations_without_arrays_are_late_one_by_one(space):
@@ -268,20 +215,22 @@ def test_network_does_not_depend_on_what_the_environment_draws():
     assert ages[0] != [each[-1]["measurement_age"] for each in run(Networked(Counter(), LATE), 50, seed=5)]
 
 
-@pytest.mark.parametrize("kind", ["dict", "tuple", "list", "tensor"])
+@pytest.mark.parametrize("kind", ["dict", "tensor"])
 def test_actions_on_their_way_stay_as_they_are(kind):
     """Whatever the agent writes into its own."""
     box = spaces.Box(-100.0, 100.0, (1,), np.float32)
-    own = {"dict": spaces.Dict(a=box), "tuple": spaces.Tuple([box])}.get(kind, box)
-    buffer = [0.0] if kind == "list" else torch.zeros(1) if kind == "tensor" else np.zeros(1, np.float32)
-    action = {"dict": {"a": buffer}, "tuple": (buffer,)}.get(kind, buffer)
-    acted = []
+    own = spaces.Dict(a=spaces.Tuple([box])) if kind == "dict" else box
+    buffer, acted = np.zeros(1, np.float32) if kind == "dict" else torch.zeros(1), []
+    action = {"a": (buffer,)} if kind == "dict" else buffer
+
+    def number(action):
+        return float((action["a"][0] if kind == "dict" else action)[0])
 
     class Listening(Counter):
         action_space = own
 
         def step(self, action):
-            acted.append(float((action["a"] if kind == "dict" else action[0] if kind == "tuple" else action)[0]))
+            acted.append(number(action))
             return super().step(np.zeros(1))
 
     env = Networked(Listening(), downlink=Channel(delay=2))
@@ -291,25 +240,12 @@ def test_actions_on_their_way_stay_as_they_are(kind):
         buffer[0] = k + 1.0
         told.append(env.step(action)[-1]["action_applied"])
     assert acted == [0.0, 0.0, 1.0, 2.0, 3.0, 4.0]
-    assert [float(np.ravel(each["a"] if kind == "dict" else each[0])[0]) for each in told] == acted
-
-
-class Echo(gym.Env):
-    """Shows the action that acts, which is the number of its step."""
-
-    observation_space = action_space = spaces.Box(-1.0, 1e6, (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.array(action, np.float32), 0.0, False, False, {}
+    assert [number(each) for each in told] == acted
 
 
 @pytest.mark.parametrize("downlink", [{"delay": 3}, {"jitter": 3, "loss": 0.3, "max_consecutive_losses": 2}])
 def test_actions_that_act_are_among_those_pending(downlink):
-    env = Networked(Echo(), downlink=Channel(**downlink), neutral=[-1.0], observe="pending_actions")
+    env = Networked(Counter(), downlink=Channel(**downlink), neutral=[-1.0], observe="pending_actions")
     observation, _ = env.reset(seed=0)
     oldest = 0
     for k in range(500):
@@ -321,11 +257,10 @@ def test_actions_that_act_are_among_those_pending(downlink):
     assert oldest == env.pending
 
 
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1", "Taxi-v4", "Blackjack-v1"])
-@pytest.mark.parametrize("settings", [{"channel": LATE}, EVERYTHING], ids=["uplink", "everything"])
-def test_checkers_pass(env_id, settings):
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "Blackjack-v1"])
+def test_checkers_pass(env_id):
     neutral = {} if env_id == "Pendulum-v1" else {"neutral": 0}
-    env = Networked(gym.make(env_id), **settings, **neutral)
+    env = Networked(gym.make(env_id), **EVERYTHING, **neutral)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # both warn of what is wrapped
         check_env(env, skip_render_check=True)
@@ -376,29 +311,19 @@ def test_channels_of_several_sensors_are_drawn_by_their_keys():
     for wrong in ({"c": DELAYED}, [NETWORK], {"a": Channel()}, {}):
         with pytest.raises(ValueError, match="channel"):
             RandomChannel(inner, wrong)
-    with pytest.raises(ValueError, match="channel must be a function"):
-        RandomChannel(Networked(gym.make("CartPole-v1")), {"a": DELAYED})
 
 
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
         ({"channel": "a.csv"}, "channel must be a Channel, .* got 'a.csv'"),
-        ({"channel": {"los": 1}}, "channel has the key 'los', which neither channels nor observations have"),
-        (
-            {"channel": {"count": Channel()}},
-            "channel has the key 'count', which neither channels nor observations have",
-        ),
+        ({"channel": {"count": Channel()}}, "channel has the key 'count', which neither channels nor observations"),
         ({"downlink": Channel(send_period=2)}, "a downlink sends a command at every step"),
         ({"downlink": LATE}, "has no zero: give neutral="),
         ({"downlink": LATE, "neutral": 7}, "neutral must be an action, got 7"),
-        (
-            {"observe": "ages"},
-            "each at most once, some of age, arrived, pending_actions, got 'ages'",
-        ),
+        ({"observe": "ages"}, "each at most once, some of age, arrived, pending_actions, got 'ages'"),
         ({"fill": "nothing"}, "fill must be 'last', 'zero' or a function"),
         ({"idle": "never"}, "idle must be one of 'hold', 'neutral', got 'never'"),
-        ({"pending": 0}, "pending must be"),
         ({"pending": 4, "observe": "age"}, "pending is how many actions a predictor gets"),
         ({"idle": "neutral"}, "idle is about a network of the actions: give downlink"),
     ],
@@ -430,15 +355,7 @@ def test_networks_that_do_not_fit_are_one_sentence():
         Networked(Networked(Counter(), LATE), LATE).reset()
 
 
-@pytest.mark.parametrize(
-    "channel",
-    [
-        Channel(loss=0.3),
-        Channel(loss=0.6, delay=1, send_period=3),
-        Channel(loss=GilbertElliott(p_good_to_bad=0.25, p_bad_to_good=0.25)),
-        Channel(loss=GilbertElliott(p_good_to_bad=0.02, p_bad_to_good=0.1, loss_good=0.1, loss_bad=0.9), delay=2),
-    ],
-)
+@pytest.mark.parametrize("channel", [Channel(loss=0.6, delay=1, send_period=3), Channel(loss=BURSTS)])
 def test_pending_actions_are_all_that_the_newest_sample_usually_lacks(channel):
     assert channel.oldest_age is None  # no contract says how many
     envs = VectorNetworked(SyncVectorEnv([Counter] * 20), channel, observe="pending_actions")
@@ -468,11 +385,7 @@ def test_predictor_that_lacks_actions_is_told_of_once():
     [
         ("Pendulum-v1", [np.nan]),
         ("Pendulum-v1", [0.1, 0.2]),
-        ("Pendulum-v1", None),
-        ("Pendulum-v1", "x"),
         ("CartPole-v1", 7),
-        ("CartPole-v1", 0.5),
-        ("CartPole-v1", np.array([1])),
     ],
 )
 def test_what_is_no_action_is_refused_where_it_is_sent_and_nothing_moves(inner, action):
@@ -486,9 +399,9 @@ def test_what_is_no_action_is_refused_where_it_is_sent_and_nothing_moves(inner, 
         np.testing.assert_array_equal(one[0], other[0])
     many = VectorNetworked(gym.make_vec(inner, num_envs=2), downlink=Channel(delay=2), neutral=NEUTRAL[inner])
     many.reset(seed=0)
-    wrong = np.array([NEUTRAL[inner]] * 3) if action is None else [action, action]
-    with pytest.raises(ValueError, match="is sent to the actuator, got"):
-        many.step(wrong)
+    for wrong in (np.array([NEUTRAL[inner]] * 3), [action, action]):
+        with pytest.raises(ValueError, match="is sent to the actuator, got"):
+            many.step(wrong)
 
 
 def test_a_step_before_the_first_reset_says_what_is_needed():
@@ -497,41 +410,28 @@ def test_a_step_before_the_first_reset_says_what_is_needed():
             env.step(env.action_space.sample())
 
 
-class WritesActions(gym.Env):
+class Writing(Counter):
     """Changes the action that it is given, as much code does."""
 
-    observation_space, action_space = spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(-1.0, 1.0, (1,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.got = []
-        return np.zeros(1, np.float32), {}
-
     def step(self, action):
-        self.got.append(float(action[0]))
+        stepped = super().step(action)
         action *= 10.0
-        action += 1.0
-        return np.zeros(1, np.float32), 0.0, False, False, {}
+        return stepped
 
 
 @pytest.mark.parametrize("is_vector", [False, True])
-@pytest.mark.parametrize("downlink", [None, Channel(loss=0.6), Channel(delay=2)])
+@pytest.mark.parametrize("downlink", [None, Channel(delay=2)])
 def test_environments_may_change_their_actions_in_place(downlink, is_vector):
-    neutral = np.array([0.25], np.float32)
-    given = {"downlink": downlink} if downlink is None else {"downlink": downlink, "neutral": neutral}
-    inner = SyncVectorEnv([WritesActions]) if is_vector else WritesActions()
-    env = (VectorNetworked if is_vector else Networked)(inner, **given)
+    neutral = np.array([0.25])
+    given = {} if downlink is None else {"downlink": downlink, "neutral": neutral}
+    env = VectorNetworked(SyncVectorEnv([Writing]), **given) if is_vector else Networked(Writing(), **given)
     neutral[:] = -1.0  # of whoever gave it
-    plant = inner.envs[0] if is_vector else inner
     for seed in range(2):
         env.reset(seed=seed)
-        sent, acted, told = [], [], []
-        for k in range(12):
-            action = np.array([0.05 * (k + 1)], np.float32)
-            sent.append(float(action[0]))
-            *_, info = env.step(action[None] if is_vector else action)
-            told.append(float(np.ravel(info["action_applied"])[0]))
-            age = int(np.ravel(info["action_age"])[0])
-            acted.append(0.25 if age < 0 else sent[k - age])
-            assert float(action[0]) == sent[k]
-        assert plant.got == told == pytest.approx(acted)
+        for k in range(6):
+            action = np.array([k + 1.0])
+            info = env.step(action[None] if is_vector else action)[-1]
+            acted = k + 1.0 if downlink is None else [0.25, 0.25, 1.0, 2.0, 3.0, 4.0][k]
+            assert np.ravel(info["acted"]) == np.ravel(info["action_applied"]) == acted
+            assert action == k + 1.0
+            action[:] = -9.0  # which is the agent's own

@@ -70,8 +70,8 @@ def between(function, ranges, count, seed=0):
 @pytest.mark.parametrize(
     ("plant", "members", "widths"),
     [
-        (TRUCK, between(truck_trailer, MASSES, 20), (2.0, 2.0, 4.0)),
-        (POLES, between(cart_pole, POLE, 8), (2.4, 3.0, 0.2, 2.0, 10.0)),
+        (TRUCK, between(truck_trailer, MASSES, 10), (2.0, 2.0, 4.0)),
+        (POLES, between(cart_pole, POLE, 4), (2.4, 3.0, 0.2, 2.0, 10.0)),
         (HULL, [np.hstack([each.A, each.B]) for each in TRUCKS], (2.0, 2.0, 4.0)),
     ],
 )
@@ -98,38 +98,14 @@ def test_limits_with_two_ends_and_inputs_under_way_count_by_their_larger_end():
     plant = family_of([of(0.3), of(0.5)])
     np.testing.assert_allclose(np.sqrt(np.diag(plant.remainder.bound.shape_matrix)), [0.0, 0.3], rtol=1e-8)
     np.testing.assert_allclose(plant.reach, [1.0, 2.0, 3.0])
-    delayed = family_of([of(0.3, input_delay=2), of(0.5, input_delay=2)])
-    np.testing.assert_allclose(np.sqrt(np.diag(delayed.remainder_bound.shape_matrix)), [0, 0.3, 0, 0], rtol=1e-8)
-    np.testing.assert_allclose(delayed.reach, [1.0, 2.0, 3.0, 3.0, 3.0])
-    limited = family_of([of(0.3, du_max=0.5), of(0.5, du_max=0.5)])
-    np.testing.assert_allclose(np.sqrt(np.diag(limited.remainder_bound.shape_matrix)), [0, 0.3, 0], rtol=1e-8)
-    for more in ({"input_delay": 2}, {"du_max": 0.5}):
+    for more, past in (({"input_delay": 2}, [3.0, 3.0]), ({"du_max": 0.5}, [3.0])):
+        made = family_of([of(0.3, **more), of(0.5, **more)])
         given = family_of(partial(of, **more), {"gain": (0.3, 0.5)}, monotone=True)
-        wanted = delayed if "input_delay" in more else limited
-        assert given.past == len(given.A) - 2
-        np.testing.assert_allclose(given.A, wanted.A, rtol=0, atol=1e-15)
-        found, right = (np.sqrt(np.diag(each.remainder.bound.shape_matrix)) for each in (given, wanted))
-        np.testing.assert_allclose(found, right, atol=1e-7)
-
-
-def test_a_state_that_holds_the_last_input_counts_by_its_own_limits():
-    def of(leak):
-        model = {"A": [[0.5, 0.1 + 0.2 * leak], [0.0, leak]], "B": [[0.0], [1.0]], "box": [2.0, 12.0], "u_max": 1.0}
-        return linear_plant(**model | {"dt": 1.0} | QUIET | {"disturbance_bound": [0.01, 0.0]})
-
-    found = [
-        family_of([of(0.0), of(0.9)]),
-        family_of([of(0.9), of(0.0)]),
-        family_of([of(-0.9), of(0.9)]),
-        family_of(of, {"leak": (0.0, 0.9)}, monotone=True),
-    ]
-    wanted = [[0.09 * 12.0, 0.45 * 12.0]] * 2 + [[0.18 * 12.0, 0.9 * 12.0], [0.09 * 12.0, 0.45 * 12.0]]
-    for plant, (first, second) in zip(found, wanted, strict=True):
-        shape = plant.remainder.bound.shape_matrix
-        assert first**2 / shape[0, 0] + second**2 / shape[1, 1] <= 1.0
-        assert plant.past == 0
-        assert plant.reach[1] == 12.0
-    np.testing.assert_allclose(found[0].remainder.bound.shape_matrix, found[1].remainder.bound.shape_matrix)
+        for each in (made, given):
+            size = np.sqrt(np.diag(each.remainder_bound.shape_matrix))
+            np.testing.assert_allclose(size, [0.0, 0.3, *(0.0 * np.array(past))], rtol=1e-8, atol=1e-7)
+            np.testing.assert_allclose(each.reach, [1.0, 2.0, 3.0, *past])
+            assert each.past == len(past)
 
 
 def test_rows_of_sums_bound_states_and_a_free_state_may_do_the_same_in_all_members():
@@ -155,15 +131,8 @@ def test_middle_is_the_middle_of_the_entries_and_all_else_that_of_the_members():
     ends = [truck_trailer(mass=mass) for mass in MASSES["mass"]]
     np.testing.assert_allclose(TRUCK.A, 0.5 * (ends[0].A + ends[1].A), rtol=1e-12)
     np.testing.assert_allclose(TRUCK.B, 0.5 * (ends[0].B + ends[1].B), rtol=1e-12)
-    same = altered(TRUCK, A=ends[0].A, B=ends[0].B, remainder=None)
-    assert same.fingerprint == ends[0].fingerprint
+    assert altered(TRUCK, A=ends[0].A, B=ends[0].B, remainder=None).fingerprint == ends[0].fingerprint
     assert TRUCK.fingerprint != altered(TRUCK, remainder=None).fingerprint
-
-
-def test_what_is_proved_stands_in_the_sentence_of_a_certificate():
-    for words in ("bounded by proof", "mass from 3800 to 4200", "monotone"):
-        assert words in TRUCK.remainder.sentence
-    assert "the convex hull of 3 plants" in HULL.remainder.sentence
 
 
 def test_file_holds_the_members_listed_of_a_function_the_corners(tmp_path):
@@ -195,9 +164,7 @@ def tank(k, delay=0, level=None, **more):
     return sampled_plant(model, **settings | QUIET | more)
 
 
-@pytest.mark.cases(2)
-@pytest.mark.parametrize("delay", [0, 1])
-@pytest.mark.parametrize("kind", ["function", "plants"])
+@pytest.mark.parametrize(("delay", "kind"), [(0, "plants"), (1, "function")])
 def test_members_that_rest_elsewhere_leave_out_no_more_than_the_bound_in_absolute_coordinates(kind, delay):
     def of(k):
         return tank(k, delay, offset=[0.0])
@@ -240,53 +207,11 @@ def test_members_are_at_rest_where_somebody_says_so():
     stays = family_of(at_two, ranges, monotone=True, at_rest=True)
     assert not stays.remainder.family.members[..., -1].any()
     assert stays.operating_state == 2.0
-    # What differs acts on a state that rests at zero.
-    one, other = (np.array([[entry, 0.1], [0.0, 0.8]]) for entry in (0.8, 0.9))
-    limits = {"box": None, "state_limits": ([-1.0, 0.0], [1.0, 2.0]), "operating_state": [0.0, 1.0]}
-    plant = family_of([linear_plant(**SMALL | limits | {"A": each}) for each in (one, other)])
-    assert "given" not in plant.remainder.sentence
-
-
-@pytest.mark.parametrize("more", [{}, {"input_delay": 2}, {"du_max": 0.5}, {"input_delay": 1, "du_max": 0.4}])
-def test_members_may_rest_with_other_inputs(more):
-    def cart(mass):
-        model = ([[0.0, 1.0], [0.0, -0.5 / mass]], [[0.0], [1.0 / mass]], [[1.0, 0.0]], [[0.0]])
-        limits = {"state_limits": ([0.0, -2.0], [2.0, 2.0]), "input_limits": (-2.0, 2.0)}
-        rests = {"operating_state": [1.0, 0.0], "operating_input": [0.3 * mass]}
-        return sampled_plant(model, dt=0.1, **limits, **rests, **QUIET, **more)
-
-    plant = family_of(cart, {"mass": (0.95, 1.05)}, monotone=True, at_rest=True)
-    np.testing.assert_allclose(plant.operating_input, 0.3)
-    np.testing.assert_allclose(plant.operating_input + plant.input_ends[:, 0], [-2.0, 2.0])
-    past = plant.past
-    np.testing.assert_allclose(plant.reach[2 : 2 + past], 2.3)
-    moves = np.abs(plant.remainder.family.members[:, :2, -1]).max(axis=0)
-    np.testing.assert_allclose(moves, [0.05 * 0.3 * 0.00495, 0.05 * 0.3 * 0.0976], rtol=0.1)
-
-
-def test_rounding_of_operating_points_is_no_step():
-    def pushed(k):
-        decay = np.exp(-0.5 * k)
-        model = {"A": [[decay, 0.0], [0.0, 1.0]], "B": [[0.5 * (1.0 - decay) / k], [0.1]], "dt": 0.5}
-        bounds = {"disturbance_bound": (np.eye(2), [-0.01, 0.0], [0.03, 0.02]), "sensor_bound": 0.02}
-        return linear_plant(**model, box=[1.0, 1.0], u_max=1.0, initial_bound=0.02, **bounds)
-
-    plant = family_of(pushed, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
-    assert np.sqrt(plant.remainder.bound.shape_matrix[1, 1]) < 1e-5  # of a limit of 1
 
 
 def family_in(document):
     """What a document of a plant says of its family."""
     return document["bounds"]["disturbance"]["Sum"]["parts"][-1]["Remainder"]["family"]
-
-
-def test_other_members_are_another_plant(tmp_path):
-    TRUCK.save(tmp_path / "plant.json")
-    content = json.loads((tmp_path / "plant.json").read_text())
-    family_in(content)["interval"][1][0][-1] += 5.0
-    family_in(content)["members"][0][0][-1] += 5.0
-    (tmp_path / "other.json").write_text(json.dumps(content))
-    assert LinearPlant.load(tmp_path / "other.json").fingerprint != TRUCK.fingerprint
 
 
 def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_from():
@@ -310,17 +235,18 @@ def test_the_bound_of_a_family_is_worked_out_from_its_members_wherever_it_comes_
     family_in(document)["members"][0][1][2] *= 3.0
     with pytest.raises(ValueError, match="must lie in its interval"):
         LinearPlant.load(document)
+    late = family_of(
+        [linear_plant(**SMALL, input_delay=1), linear_plant(**SMALL | {"B": [[0.0], [0.4]]}, input_delay=1)]
+    )
+    document = json.loads(json.dumps(late.document))
+    family_in(document)["members"][0][2][3] *= 0.5  # of the input under way
+    with pytest.raises(ValueError, match="must have the past inputs of the plant of the middle"):
+        LinearPlant.load(document)
 
 
-@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     ("changed", "name"),
-    [
-        ({"disturbance_bound": 0.05}, r"Bounds\(disturbance=...\)"),
-        ({"box": [1.0, 1.0]}, "Limits of states"),
-        ({"H": [[1.0, 0.1], [0.0, 1.0]]}, "H"),
-        ({"u_max": 2.0}, "Limits of inputs"),
-    ],
+    [({"disturbance_bound": 0.05}, r"Bounds\(disturbance=...\)"), ({"H": [[1.0, 0.1], [0.0, 1.0]]}, "H")],
 )
 def test_what_members_share_is_compared_inside_the_ranges(changed, name):
     def of(angle):
@@ -347,56 +273,19 @@ def test_two_ended_disturbances_move_each_member():
     assert 0.02 <= width <= 0.02 + 5e-8  # what the members' rest lacks of an equilibrium by rounding is inside
 
 
-@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
-def test_middle_of_members_that_a_disturbance_moves_to_one_point_is_about_that_point():
-    def pushed(a):
-        push = ([[1.0], [0.0]], [0.0], [1.0])
-        return linear_plant(**SMALL | {"A": [[0.5, 0.0], [0.0, a]], "box": [3.0, 2.0], "disturbance_bound": push})
-
-    plant = family_of([pushed(0.5), pushed(0.7)])
-    np.testing.assert_array_equal(plant.operating_state, [1.0, 0.0])
-    np.testing.assert_allclose(plant.own_limits, [[-4.0, -2.0], [2.0, 2.0]])
-
-
-def test_balls_count_once_where_inputs_are_under_way():
-    def late(a, at):
-        model = {"A": [[a]], "B": [[1.0]], "dt": 1.0, "operating_state": [at], "operating_input": [0.0]}
-        limits = {"state_limits": (-3.0, 5.0), "input_limits": (-1.0, 1.0), "input_delay": 1}
-        return linear_plant(**model, **limits, gamma=1e-4, sensor_bound=0.0, initial_bound=0.0)
-
-    plant = family_of([late(0.4, 0.5), late(0.6, 1.0)], at_rest=True)
-    np.testing.assert_array_equal(plant.operating_state, [0.75, 0.0])
-    np.testing.assert_allclose(plant.disturbance_bound.shape_matrix, np.diag([1e-4, 0.0]), rtol=1e-3)
-
-
 def read_back(plant):
     return LinearPlant.load(json.loads(json.dumps(plant.document)))
 
 
-@pytest.mark.parametrize("known", [lambda plant: plant, read_back], ids=["made", "read"])
 @pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
-def test_members_belong_to_the_point_that_they_are_in_deviations_from(known):
+def test_members_belong_to_the_point_that_they_are_in_deviations_from():
     point = {"operating_state": [1.0, 0.5], "operating_input": [0.3]}
-    for plant in (family_of(two(B=[[0.0], [0.4]])), family_of([linear_plant(**SMALL | point)] * 2)):
-        plant = known(plant)
+    for plant in (family_of(two(B=[[0.0], [0.4]])), read_back(family_of([linear_plant(**SMALL | point)] * 2))):
         x, u = plant.operating_state + 0.1, plant.operating_input
         moved = {"operating_state": x, "state_limits": (x - 1.0, x + 3.0), "input_limits": (u - 3.0, u + 3.0)}
         for change in ({"disturbance_bound": ([[1.0], [0.0]], [0.0], [0.01])}, {"operating_input": u} | moved):
             with pytest.raises(ValueError, match="in deviations from another operating point"):
                 altered(plant, **change)
-
-
-@pytest.mark.cases(1)
-@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
-@pytest.mark.parametrize("low", [0.25, 0.5, 0.11])
-def test_members_inside_the_ranges_may_differ_by_the_rounding_of_where_they_rest(low):
-    def of(a):
-        model = {"A": [[a]], "B": [[0.5]], "dt": 1.0, "box": [1.0], "u_max": 0.9, "sensor_bound": 0.01}
-        return linear_plant(**model, initial_bound=0.01, disturbance_bound=([[0.1]], [0.0], [1.0]))
-
-    family = family_of(of, {"a": (low, low + 0.25)}, monotone=True, at_rest=True).members
-    for value in np.linspace(low, low + 0.25, 25):
-        assert family.member(np.array([value]))[0, 0] == value
 
 
 def bent(mass):
@@ -433,9 +322,7 @@ REFUSED = {
     "ranges of plants": (lambda: family_of(TRUCKS, MASSES), "about a function"),
     "one plant": (lambda: family_of(TRUCKS[:1]), "two plants or more"),
     "no truth value": (lambda: family_of(TRUCKS, at_rest="no"), "at_rest must be"),
-    "no plant": (lambda: family_of([*TRUCKS, 3]), "must be plants"),
     "another box": (lambda: family_of(two(box=[1.0, 1.0])), "member 1 differs in Limits of states"),
-    "another noise": (lambda: family_of(two(disturbance_bound=0.1)), r"differs in Bounds\(disturbance=...\)"),
     "a step": (lambda: family_of(truck_trailer, {"dt": (0.4, 0.5)}, monotone=True), "differs in dt"),
     "a remainder": (lambda: family_of(two(remainder=LEFT_OUT)), "without a remainder of their own"),
     "between samples": (lambda: family_of([SAMPLED, SAMPLED]), "without between_samples"),

@@ -6,17 +6,13 @@ import pytest
 import ncs_gym
 from ncs_gym import Ellipsoid, truck_trailer
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.processes.cart_pole_process import nonlinear_cart_pole
-from ncs_gym.processes.gym_pendulum import pendulum
-from ncs_gym.processes.mujoco_pendulum import inverted_pendulum
 from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
-from tests.product import altered, library_plant, linear_plant
+from tests.product import altered, linear_plant
 
 BOUNDS = {"disturbance_bound": 0.01, "sensor_bound": 0.02, "initial_bound": 0.03}
 SETS = {"disturbance_bound": "disturbance", "sensor_bound": "sensor_error", "initial_bound": "initial_error"}
 KINDS = {
-    "number": 0.05,
     "half-widths": [0.05, 0.002],
     "ellipsoid": Ellipsoid([[4e-3, 1e-3], [1e-3, 2e-3]]),
     "directions": ([[0.1], [0.5]], 0.2),
@@ -47,34 +43,7 @@ def test_declared_bound_adds_to_what_covariances_and_gamma_bound(name, kind):
         assert getattr(plant, SETS[name]).support(direction) >= need * (1 - 1e-8)
 
 
-def test_sensor_error_with_a_quantizer_holds_the_declared_noise_too():
-    plant = altered(truck_trailer(), sensor_bound=[0.1, 0.001])
-    for direction in np.random.default_rng(0).standard_normal((200, 2)):
-        parts = [0.05 / np.sqrt(2.0) * np.linalg.norm(direction)]
-        parts += [plant.sensor_noise.bound.support(direction), plant.sensor_bound.support(direction)]
-        assert plant.sensor_error_with(0.05).support(direction) >= sum(parts)
-
-
-# Certificates and agents that are stored belong to these.
-REGISTERED = {
-    truck_trailer: "95e3532724d6",
-    lambda: truck_trailer(4000.0): "03c8442904a7",
-    ncs_gym.cart_pole: "a24fdb2082ae",
-    ncs_gym.plants.library.batch_reactor: "c4e17ad0a41a",
-    pendulum: "8ec05e31669c",
-    nonlinear_cart_pole: "bc0bbe28eb93",
-    inverted_pendulum: "484e1ba16a42",
-}
-
-
-@pytest.mark.parametrize("make", REGISTERED)
-def test_registered_plants_keep_their_fingerprints(make):
-    plant = make()
-    assert plant.fingerprint.startswith(REGISTERED[make])
-    assert altered(plant, dt=2.0 * plant.dt, continuous_model=None, remainder=None).fingerprint != plant.fingerprint
-
-
-@pytest.mark.cases(10)
+@pytest.mark.cases(8)
 @pytest.mark.parametrize("name", BY_NAME)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("gamma", [0.0, 1e-3])
@@ -92,15 +61,6 @@ def test_every_disturbance_uses_the_declared_bound_and_stays_inside(name, kind, 
     assert beyond_gamma > 0.4 * np.linalg.norm(axis)
 
 
-@pytest.mark.parametrize(("bound", "source"), [("sensor_bound", "of_sensor"), ("initial_bound", "of_first_error")])
-def test_noise_is_drawn_from_the_declared_bound_up_to_its_edge(bound, source):
-    plant = plain(**{bound: [0.2, 0.01]})
-    rng = np.random.default_rng(0)
-    gauges = getattr(plant, bound).gauge(getattr(plant, source).drawn(rng, 2000))
-    assert 0.99 < gauges.max() <= 1.0 + 1e-12
-    assert getattr(plant, source).drawn(rng).shape == (2,)
-
-
 def test_estimator_picks_useful_gains_from_declared_bounds_alone():
     """Without a covariance the filter would not believe its sensors at all."""
     plant = plain(A=0.95 * np.eye(2), disturbance_bound=0.1, sensor_bound=0.01)
@@ -109,16 +69,6 @@ def test_estimator_picks_useful_gains_from_declared_bounds_alone():
     for step in range(1, 6):
         estimator.advance(np.zeros(1), [ncs_gym.Packet(step, np.array([0.3, -0.2]))])
     np.testing.assert_allclose(estimator.mean, [0.3, -0.2], atol=0.02)
-
-
-def test_assumptions_name_what_is_zero_and_what_is_truncated():
-    assert plain().assumptions == ()
-    nothing = " ".join(plain(**dict.fromkeys(BOUNDS, 0.0)).assumptions)
-    for words in ("no disturbance acts", "measure without noise", "the first estimate is exact"):
-        assert f"It is assumed that {words}" in nothing or words in nothing
-    assert "Gaussian" not in nothing
-    (sentence,) = library_plant(truck_trailer, delta=0.01).assumptions
-    assert "99 % (delta = 0.01) of disturbances, sensor noise, the first error, not the rest" in sentence
 
 
 def test_first_error_along_an_oblique_line_is_held_in_rational_arithmetic():
@@ -150,7 +100,6 @@ def test_covariance_may_lack_the_rounding_of_its_own_type(given):
     ("given", "message"),
     [
         ([[1e-12, 2e-9], [2.1e-9, 1.0]], "symmetric"),
-        ([[1e-12, 2e-6], [2e-6, 1.0]], "positive semidefinite"),
         ([[1e-12, 1e-6, 0.0], [1e-6, 1.0, 0.1], [0.0, 0.1, 1.0]], "positive semidefinite"),
         ([[0.0, 1e-9], [1e-9, 1.0]], "positive semidefinite"),
     ],

@@ -41,19 +41,6 @@ PLANTS = {
 }
 
 
-def test_short_form_has_no_numbers():
-    plant = truck_trailer()
-    assert repr(plant) == f"<LinearPlant: 2 states, 1 input, 2 outputs, fingerprint {plant.fingerprint[:16]}>"
-
-
-def test_the_unit_1_is_no_unit():
-    valve = linear_plant(**STABLE, box=1.0, input_limits=(0.0, 1.0), operating_input=[0.5], operating_state=[0.0, 0.0])
-    described = str(altered(valve, state_units=["1", "m"], input_units=("1",), input_names=("valve",)))
-    assert "0 <= valve <= 1 (operating point 0.5)" in described
-    assert "|x1| <= 1\n" in described
-    assert "|x2| <= 1 m\n" in described
-
-
 @pytest.mark.parametrize("name", PLANTS)
 def test_file_gives_back_the_same_plant(name, tmp_path):
     plant = PLANTS[name]
@@ -96,29 +83,3 @@ def test_text_shows_limits_bounds_and_sampling_time_with_units():
     ):
         assert words in text
     assert "dynamics        stable (spectral radius 0.493817)" in str(truck_trailer())
-
-
-def test_text_shows_slanted_rows_and_the_operating_point():
-    text = str(ODD)
-    assert "17 <= heat + 0.3 flow <= 23 (operating point 20)" in text
-    assert "|flow| <= 0.1429" in text
-    assert "-0.333333 <= u1 <= 1 (operating point 0.333333)" in text
-    pushed = {"disturbance_bound": (np.eye(2), [-0.1, -0.01], [0.3, 0.01])}
-    assert "disturbance     x1 from -0.1 to 0.3, x2 up to 0.01\n" in str(
-        linear_plant(**STABLE | pushed, box=[5.0, 5.0], u_max=1.0)
-    )
-    assert "It is assumed that the first estimate is exact." in " ".join(text.split())
-    assert "nan" not in text
-
-
-def test_limits_of_coupled_inputs_are_listed_where_inputs_take_effect_later():
-    plant = linear_plant(
-        A=0.9 * np.eye(2), B=np.eye(2), dt=0.1, box=[1.0, 2.0], u_max=[1.0, 1.0],
-        disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.01, input_delay=1,
-        mixed_limits=[([0.0, 0.0], [1.0, 1.0], -0.5, 0.5)],
-    )  # fmt: skip
-    assert "|u1 of 1 step ago + u2 of 1 step ago| <= 0.5\n" in str(plant)
-    assert "|u2| <= 1\n                inputs take effect 1 step later\n" in str(plant)
-    assert str(plant).count("of 1 step ago") == 2  # rows of past inputs alone limit nothing
-    state = [0.5, -3.0, 0.0, 0.2]
-    np.testing.assert_array_equal(plant.constraint_values(state), plant.constraint_values(np.array(state)))

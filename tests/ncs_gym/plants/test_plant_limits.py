@@ -36,13 +36,6 @@ def test_limits_around_an_operating_point_keep_both_ends():
             getattr(plant, name)
 
 
-def test_limits_that_are_symmetric_but_for_rounding_are_the_short_form():
-    point = {"operating_state": [0.1], "operating_input": [0.1]}
-    plant = linear_plant(**ROOM | point, state_limits=(-0.1, 0.3), input_limits=(-0.2, 0.4))
-    assert plant.is_symmetric
-    np.testing.assert_allclose(plant.u_max, [0.3])
-
-
 def test_values_of_a_constraint_are_distances_beyond_the_nearer_end_in_units_of_half_the_range():
     limits = {"state_limits": ([-1.0, -2.0], [3.0, np.inf]), "u_max": 1.0}
     plant = linear_plant(**MODEL | limits, output_limits=[([1.0, 1.0], -np.inf, 4.0)])
@@ -61,12 +54,6 @@ def test_actions_reach_both_ends_and_never_beyond():
         middle, half = plant.input_middle, plant.input_half
         assert low <= (half * -1.0 + middle).item() <= low + 1e-15 * (high - low)
         assert high - 1e-15 * (high - low) <= (half * 1.0 + middle).item() <= high
-
-
-def test_a_number_stands_for_a_vector_of_one_entry():
-    limits = {"state_limits": (18.0, 25.0), "input_limits": (0.0, 12.0)}
-    plant = linear_plant(**ROOM | {"operating_state": 20.0, "operating_input": 10.0}, **limits)
-    assert plant.fingerprint == linear_plant(**ROOM, **limits).fingerprint
 
 
 def test_own_limits_are_the_closest_of_each_state_alone():

@@ -60,19 +60,6 @@ def test_discrete_model_is_taken_as_it_is(name):
         assert sampled_plant(DISCRETE[name], **REST).fingerprint == plant.fingerprint
 
 
-def test_model_takes_limits_around_an_operating_point():
-    settings = {name: value for name, value in REST.items() if name not in ("box", "u_max")}
-    point = {"operating_state": [1.0, 0.0], "operating_input": [2.0]}
-    limits = {"state_limits": ([0.0, -1.0], [3.0, 1.0]), "input_limits": (0.0, 3.0)}
-    plant = sampled_plant((A, B, C, D), dt=0.1, input_delay=1, **point, **limits, **settings)
-    np.testing.assert_allclose(plant.box[:2], [[1.0 / 1.5, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    np.testing.assert_allclose(plant.box_ends[:, :2] / [1.0 / 1.5, 1.0], [[-1.0, -1.0], [2.0, 1.0]])
-    np.testing.assert_allclose(plant.input_ends, [[-2.0], [1.0]])
-    np.testing.assert_allclose(plant.box_ends[:, 2] / plant.box[2, 2], [-8.0, 4.0])  # of the input under way
-    np.testing.assert_allclose(plant.operating_state, [1.0, 0.0, 2.0])
-    np.testing.assert_allclose(plant.A @ plant.operating_state + plant.B @ [2.0], plant.operating_state)
-
-
 def test_past_inputs_are_named_by_their_age():
     names = {"state_names": ["angle", "rate"], "input_names": ["torque"], "input_units": ["N m"]}
     plant = sampled_plant((A, B, C, D), dt=0.1, input_delay=2, **REST | names)
@@ -100,10 +87,3 @@ def test_disturbances_of_a_delayed_plant_leave_its_stored_inputs_alone(name):
     np.testing.assert_array_equal(plant.of_first_error.drawn(rng)[2:], 0.0)
     assert (np.diag(plant.disturbance.shape_matrix)[2:] < 1e-12).all()
     assert (np.diag(plant.initial_error.shape_matrix)[2:] < 1e-12).all()
-
-
-def test_disturbance_of_a_delayed_plant_holds_that_of_the_plant_itself():
-    noise = {"gamma": 1e-4, "process_noise_cov": 1e-4 * np.eye(2)}
-    plain, plant = (sampled_plant((A, B, C, D), dt=0.1, input_delay=d, **(REST | noise)) for d in (0, 1))
-    for direction in np.random.default_rng(0).standard_normal((100, 2)):
-        assert plant.disturbance.support([*direction, 0.0]) >= (1 - 1e-9) * plain.disturbance.support(direction)

@@ -66,22 +66,6 @@ def test_sampled_bound_is_tight_and_grows_with_the_safety_factor():
     assert np.linalg.eigvalsh(once.remainder.bound.shape_matrix)[0] < 1e-7 * np.trace(once.remainder.bound.shape_matrix)
 
 
-def test_fitted_slope_leaves_less_out_than_the_slope_at_rest():
-    """The best slope of a sine leaves out a third of what the tangent does, or less."""
-    best = model(safety_factor=1.0 + 1e-3)
-    tangent = model(safety_factor=1.0 + 1e-3, A=[[1.0 + STEP * PULL, STEP], [PULL, 1.0]], B=[[0.0075], [0.15]])
-    assert np.trace(best.remainder.bound.shape_matrix) < np.trace(tangent.remainder.bound.shape_matrix) / 9.0
-
-
-def test_linear_process_leaves_nothing_out():
-    plant = linear_model(
-        lambda x, u: np.array([[0.5, 0.1], [0.0, 0.7]]) @ x + u, [1.0, 2.0], [1.0, 3.0], 0.1, samples=500, **QUIET
-    )
-    np.testing.assert_allclose(plant.A, [[0.5, 0.1], [0.0, 0.7]], atol=1e-9)
-    np.testing.assert_allclose(plant.B, np.eye(2), atol=1e-9)
-    assert np.sqrt(plant.remainder.bound.shape_matrix.max()) < 1e-9
-
-
 @pytest.mark.filterwarnings("ignore::ncs_gym.processes.linearization.NoEquilibriumWarning")
 @pytest.mark.parametrize("offset", [0.0, 0.02, -0.02])
 def test_proved_bound_holds_what_a_step_from_rest_leaves_out(offset):
@@ -97,17 +81,17 @@ def test_proved_bound_holds_what_a_step_from_rest_leaves_out(offset):
 
 
 def test_proved_bound_reaches_to_the_farther_end():
-    """The same kink between -0.5 and 2, with an input between -1 and 3: attained at the far ends."""
+    """The same kink between -0.5 and 2, with an input between -3 and 1: attained at the far ends."""
 
     def kinked(state, u):
         return 0.5 * state + 0.3 * u + 0.1 * np.abs(state) + 0.05 * np.abs(u)
 
-    limits = {"state_limits": (4.5, 7.0), "operating_state": 5.0, "input_limits": (-2.0, 2.0), "operating_input": -1.0}
+    limits = {"state_limits": (4.5, 7.0), "operating_state": 5.0, "input_limits": (-2.0, 2.0), "operating_input": 1.0}
     bounds = [[0.4, 0.25]], [[0.6, 0.35]]
     plant = linear_model(kinked, dt=0.1, jacobian_bounds=bounds, samples=200, **limits, **QUIET)
     reach = np.sqrt(plant.remainder.bound.shape_matrix.item())
     np.testing.assert_allclose(reach, 0.1 * 2.0 + 0.05 * 3.0, rtol=1e-6)
-    np.testing.assert_allclose(reach, kinked(2.0, 3.0) - plant.A.item() * 2.0 - plant.B.item() * 3.0, rtol=1e-6)
+    np.testing.assert_allclose(reach, kinked(2.0, -3.0) - plant.A.item() * 2.0 + plant.B.item() * 3.0, rtol=1e-6)
 
 
 LEVEL, FLOW = 0.6, 0.5 * np.sqrt(0.6)
@@ -145,24 +129,8 @@ def test_bound_holds_between_two_different_ends_and_no_further():
     assert halved.remainder.bound.shape_matrix.item() < 0.25 * plant.remainder.bound.shape_matrix.item()
 
 
-def test_shielded_tank_stays_between_its_ends_whatever_disturbs_it():
-    """The tank's own equations with a disturbance, in absolute levels, driven to both ends."""
-    plant = linear_model(tank, **TANK)
-    process, channel = FunctionProcess(tank), Channel(loss=0.3, max_consecutive_losses=2)
-    env = safety_shield(gym_env(plant=plant, process=process, channel=channel))
-    reached = []
-    for seed in range(2):
-        env.reset(seed=seed)
-        for step in range(200):
-            *_, info = env.step(np.array([1.0 if (step // 50 + seed) % 2 else -1.0], np.float32))
-            reached.append(LEVEL + info["state"].item())
-            assert info["shield_guaranteed"]
-    assert 0.2 <= min(reached) < 0.35
-    assert 1.3 < max(reached) <= 2.0
-
-
 @pytest.mark.cases(1)
-@pytest.mark.parametrize("past", [{"du_max": 0.3}, {"input_delay": 2}, {"du_max": 0.3, "input_delay": 1}])
+@pytest.mark.parametrize("past", [{"du_max": 0.3}, {"du_max": 0.3, "input_delay": 1}])
 def test_past_inputs_are_kept_beside_the_process_which_moves_the_others(past):
     """What is left of a step of the tank, with the input that acts, is the declared disturbance."""
     plant = linear_model(tank, **TANK | past)
@@ -190,31 +158,11 @@ def test_past_inputs_are_kept_beside_the_process_which_moves_the_others(past):
         np.testing.assert_allclose(many, np.broadcast_to(one, many.shape), atol=1e-12)
 
 
-def test_another_environment_moves_the_states_that_are_no_past_inputs():
-    """`Pendulum-v1` with a limit of how fast its torque changes, beside the equations of its documentation."""
-    bounds = {"disturbance_bound": 0.0, "sensor_bound": [0.002, 0.01], "initial_bound": [0.005, 0.03]}
-    plant = linear_model(PendulumProcess(), BOX, TORQUE, STEP, samples=2_000, du_max=1.5, **bounds)
-    assert plant.n == 3
-    env = gym_env(plant=plant, process=PendulumProcess())
-    _, info = env.reset(seed=0, options={"state": [0.1, -0.2, 0.4]})
-    for action in ([0.5], [-0.25], [0.125]):
-        before = info["state"]
-        *_, info = env.step(np.array(action, np.float32))
-        np.testing.assert_allclose(info["state"][:2], swing(before[:2], TORQUE * np.array(action)), atol=1e-7)
-        assert info["state"][2] == TORQUE * action[0]
-    env.close()
-
-
 def test_disturbance_that_moves_the_operating_point_is_refused():
     """The remainder was bounded around another point, and the function counts from it."""
     disturbed = TANK | {"disturbance_bound": ([[1.0]], [0.0], [0.004])}
     with pytest.warns(MovedOperatingPointWarning), pytest.raises(ValueError, match="another model"):
         linear_model(tank, **disturbed)
-    # Of a tank without an outflow of its own the input alone moves.
-    integrating = {"A": [[1.0]], "B": [[0.2]], "operating_input": 0.5} | disturbed | {"operating_input": 0.5}
-    with pytest.warns(MovedOperatingPointWarning) as told, pytest.raises(ValueError, match="another model"):
-        linear_model(lambda x, u: x + 0.2 * u - 0.01 * x * u, **integrating)
-    assert f"rests: {[LEVEL]}, [0.49]" in str(told[0].message)
 
 
 def test_pendulum_is_proved_by_another_route():
@@ -268,27 +216,19 @@ def test_operating_point_that_does_not_stay_is_told():
     assert moved.remainder.bound.shape_matrix.item() < model.remainder.bound.shape_matrix.item()
 
 
-@pytest.mark.parametrize(
-    "limits",
-    [
-        {"mixed_limits": [([0.0, 0.0], [1.0, 1.0], -1.0, 1.0)]},
-        {"output_limits": [([4.0, 1.0], -1.0, 1.0)], "state_limits": ([-1.0, -1.0], [1.0, 1.0])},
-    ],
-)
-def test_remainder_is_not_sampled_where_limits_of_several_entries_forbid(limits):
+def test_remainder_is_not_sampled_where_limits_of_several_entries_forbid():
     """Beyond them this process does what no linear model bears."""
 
     def bursting(state, u):
-        beyond = max(abs(u[0] + u[1]) - 1.0, 0.0) if "mixed_limits" in limits else abs(state @ [4.0, 1.0]) - 1.0
-        return 0.5 * state + 0.1 * u[0] + (50.0 if beyond > 1e-9 else 0.0)
+        beyond = max(abs(u[0] + u[1]), abs(state @ [4.0, 1.0])) > 1.0 + 1e-9
+        return 0.5 * state + 0.1 * u[0] + (50.0 if beyond else 0.0)
 
-    settings = {"box": None if "state_limits" in limits else [1.0, 1.0], "samples": 2_000} | QUIET | limits
-    plant = linear_model(bursting, u_max=[1.0, 1.0], dt=STEP, **settings)
+    settings = {"state_limits": ([-1.0, -1.0], [1.0, 1.0]), "u_max": [1.0, 1.0], "samples": 2_000} | QUIET
+    limits = {"output_limits": [([4.0, 1.0], -1.0, 1.0)], "mixed_limits": [([0.0, 0.0], [1.0, 1.0], -1.0, 1.0)]}
+    plant = linear_model(bursting, dt=STEP, **settings, **limits)
     assert plant.remainder.bound.support(np.eye(2)).max() < 1e-6
-    if "mixed_limits" in limits:
-        fewer = {"mixed_rows": None, "mixed_ends": None}
-        with pytest.raises(ValueError, match="another model, limits or operating point"):
-            altered(plant, **fewer)
+    with pytest.raises(ValueError, match="another model, limits or operating point"):
+        altered(plant, mixed_rows=None, mixed_ends=None)
 
 
 def test_remainder_belongs_to_the_plant_that_it_was_found_for(tmp_path):

@@ -41,15 +41,6 @@ def test_profile_is_piecewise_constant_in_range_and_changes_at_its_rate(plant):
     assert 24.0 < max(targets) <= 25.0
 
 
-def test_observation_bound_is_never_exceeded_at_full_throttle():
-    plant, task = truck_trailer(), SpeedTracking()
-    rng = np.random.default_rng(0)
-    task_state = np.array([25.0, 0.0])
-    for _ in range(200):
-        task_state = task.advance(rng, plant, task_state, plant.u_max)
-        assert abs(task.observe(task_state)[0]) <= task.observation_bound(plant, 200)[0]
-
-
 def setpoints(**changes):
     return SetpointTracking(**({"output": [1.0, 0.0], "reach": 0.8, "width": 2.0} | changes))
 
@@ -189,87 +180,68 @@ def test_what_is_predicted_does_not_move_the_state_of_a_task():
             make("ncs_gym/LinearNCS-v0", task=Counting(np.zeros(1)), **settings).reset(seed=0)
 
 
-class Smooth(Paying):
-    """Remembers something in itself, as `how` says, when `moment` comes."""
+class Smooth(Task):
+    """Remembers something in itself when a moment comes."""
 
-    def __init__(self, how, moment):
-        self.how, self.moment, self.count, self.seen, self.last = how, moment, 0, [], np.zeros(1)
+    def __init__(self, moment):
+        self.moment, self.count, self.last = moment, 0, np.zeros(1)
 
-    def remember(self, moment, u):
-        if self.moment == moment:
-            self.how(self, u)
+    def remember(self, moment):
+        if moment == self.moment:
+            self.count += moment != "reward"
+            self.last += moment == "reward"
 
     def begin(self, rng, plant, size=None):
-        self.remember("begin", np.ones(1))
+        self.remember("begin")
         return super().begin(rng, plant, size)
 
     def advance(self, rng, plant, task_state, u):
-        self.remember("advance", u)
+        self.remember("advance")
         return task_state
 
     def reward(self, plant, task_state, state, u):
-        self.remember("reward", u)
-        return -float(np.sum(state * self.weights))
+        self.remember("reward")
+        return -np.sum(state * self.weights, axis=0)
 
     @cached_property
     def weights(self):
         """Computed once, which is no memory of an episode."""
-        return np.ones((2, *[1] * (type(self) is SmoothMany)))
+        return np.ones(1)
 
 
 class SmoothMany(Smooth):
     vectorized = True
 
-    def reward(self, plant, task_state, state, u):
-        return -np.sum(state * self.weights, axis=0)
 
-
-def count(task, u):
-    task.count += 1
-
-
-def write_last(task, u):
-    task.last[:] = u[:1]
-
-
-REMEMBERED = {count: "count", write_last: "last"}
-
-
-@pytest.mark.parametrize("how", REMEMBERED)
 @pytest.mark.parametrize(
-    ("kind", "moment"), [(Smooth, "begin"), (Smooth, "advance"), (Smooth, "reward"), (SmoothMany, "begin")]
+    ("kind", "moment", "name"),
+    [(Smooth, "advance", "count"), (Smooth, "reward", "last"), (SmoothMany, "begin", "count")],
 )
-def test_what_a_task_stores_in_itself_is_refused_where_environments_share_it(kind, how, moment):
-    settings = {"plant": truck_trailer(mass=4000.0), "task": kind(how, moment)}
-    envs = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=3, **settings)
-    message = f"{kind.__name__} stores '{REMEMBERED[how]}' in itself, which all environments of a vector share"
+def test_what_a_task_stores_in_itself_is_refused_where_environments_share_it(kind, moment, name):
+    settings = {"plant": truck_trailer(mass=4000.0), "task": kind(moment)}
+    env, envs = (make("ncs_gym/LinearNCS-v0", **settings) for make in (gym.make, partial(gym.make_vec, num_envs=3)))
+    env.reset(seed=0)
+    env.step(np.ones(1, np.float32))
+    message = f"{kind.__name__} stores '{name}' in itself, which all environments of a vector share"
     if moment != "begin":
         envs.reset(seed=0)
     with pytest.raises(ValueError, match=message):
         envs.reset(seed=0) if moment == "begin" else envs.step(np.ones((3, 1), np.float32))
-    if kind is Smooth:
-        env = gym.make("ncs_gym/LinearNCS-v0", **settings)
-        env.reset(seed=0)
-        env.step(np.ones(1, np.float32))
 
 
 class Drifting(Disturbance):
     """A disturbance that remembers in itself where it is."""
 
-    def __init__(self, at_start):
-        self.at_start, self.at = at_start, 0.0
-
-    def begin(self, rng, plant, size=None):
-        self.at = 0.0 if self.at_start else self.at
+    def __init__(self):
+        self.at = 0.0
 
     def draw(self, rng, plant, nominal_next, step, memory):
         self.at += 1e-6
         return np.zeros(plant.n)
 
 
-@pytest.mark.parametrize("at_start", [True, False])
-def test_what_a_disturbance_stores_in_itself_is_refused_where_environments_share_it(at_start):
-    settings = {"plant": truck_trailer(mass=4000.0), "disturbance": Drifting(at_start)}
+def test_what_a_disturbance_stores_in_itself_is_refused_where_environments_share_it():
+    settings = {"plant": truck_trailer(mass=4000.0), "disturbance": Drifting()}
     gym.make("ncs_gym/LinearNCS-v0", **settings).reset(seed=0)
     envs = gym.make_vec("ncs_gym/LinearNCS-v0", num_envs=3, **settings)
     envs.reset(seed=0)

@@ -2,7 +2,6 @@
 
 from fractions import Fraction
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
@@ -13,7 +12,6 @@ from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.uncertainty.disturbances import BallDisturbance
 from tests.product import library_plant, linear_plant, loop_env, vector_env
 
-IDS = ("TruckTrailer", "CartPole")
 DELTA = 0.2
 CALM = {"A": [[0.5]], "B": [[1.0]], "box": [[1.0]], "u_max": 1.0, "dt": 0.1, "delta": DELTA}
 
@@ -58,18 +56,6 @@ def test_gaussian_noise_is_that_of_the_covariances_and_truncated_noise_is_not(ma
             assert (kstest(energies(covariance, draws), chi2(2).cdf).pvalue > 1e-3) == (noise == "gaussian")
             outside = np.mean(energies(covariance, draws) > plant.process_noise.energy)
             assert 0.7 * DELTA < outside < 1.3 * DELTA if noise == "gaussian" else outside == 0.0
-
-
-@pytest.mark.parametrize("name", IDS)
-def test_errors_of_registered_environments_leave_their_bounds(name):
-    many = gym.make_vec(f"ncs_gym/{name}-v0", num_envs=64, noise="gaussian", max_episode_steps=-1)
-    escaped = False
-    _, info = many.reset(seed=0)
-    for _ in range(30):
-        shapes, errors = info["error_shape"], info["estimation_error"]
-        escaped |= bool((np.einsum("ki,ki->k", errors, np.linalg.solve(shapes, errors[..., None])[..., 0]) > 1.0).any())
-        *_, info = many.step(np.zeros(many.action_space.shape, np.float32))
-    assert escaped  # at delta = 0.05 some of 64 first errors alone lie outside their bound
 
 
 def test_what_is_bounded_by_declaration_stays_inside_its_bound():
@@ -135,19 +121,12 @@ def test_bound_violation_probability_counts_only_what_is_gaussian():
     bounded = linear_plant(**CALM, gamma=0.01, sensor_bound=0.1, initial_bound=0.1)
     assert bound_violation_probability(bounded, channel, 10**6) == 0.0
     assert bound_violation_probability(truck_trailer(), channel, 10**6) == 1.0
-    assert bound_violation_probability(library_plant(truck_trailer, delta=1e-3), channel, 0) == pytest.approx(
-        1e-3, rel=1e-9
-    )
 
 
 def test_share_of_episodes_with_an_escape_is_what_the_bound_says():
     # Escapes counted where they happen, draw by draw: with independent draws the union bound is nearly attained.
-    plant, channel, steps, count = (
-        library_plant(truck_trailer, gamma=0.0, delta=5e-4),
-        Channel(send_period=2),
-        200,
-        2000,
-    )
+    plant, channel = library_plant(truck_trailer, gamma=0.0, delta=1e-3), Channel(send_period=2)
+    steps, count = 100, 2000
     process = simulation_of(vector_env(count, plant=plant, channel=channel, noise="gaussian"))
     rng, zero, none = np.random.default_rng(1), np.zeros((2, count)), np.zeros(count, np.int64)
     escaped = plant.initial_noise.bound.gauge(process.first_error(np.random.default_rng(0), count).T) > 1.0

@@ -31,15 +31,6 @@ def test_batched_draws_equal_scalar_ones(source):
         np.testing.assert_allclose(drawn[:, i], one, atol=1e-7)
 
 
-def test_a_disturbance_beyond_its_bound_raises():
-    env = vector_env(3, plant=truck_trailer(), disturbance=lambda rng, plant, nominal: np.ones(2))
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="outside its bound"):
-        env.step(np.zeros((3, 1), np.float32))
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(np.zeros((3, 1), np.float32))
-
-
 class Loud(BoxDisturbance):
     """A user's class that may be drawn ahead, with one draw outside every bound."""
 
@@ -67,8 +58,9 @@ def test_disturbances_that_are_drawn_ahead_are_checked(kind):
     for source, words in ((Loud(), "outside its bound"), (Misshapen(), "finite with shape")):
         env = kind(plant=truck_trailer(), disturbance=source)
         env.reset(seed=0)
-        with pytest.raises(ValueError, match=words):
-            env.step(np.zeros(env.action_space.shape, np.float32))
+        for error, said in ((ValueError, words), (gym.error.ResetNeeded, "")):
+            with pytest.raises(error, match=said):
+                env.step(np.zeros(env.action_space.shape, np.float32))
     env = kind(plant=truck_trailer(), disturbance=Loud(), allow_assumption_violation=True)
     env.reset(seed=0)
     *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
@@ -97,10 +89,10 @@ def test_a_disturbance_that_writes_into_what_it_is_given_moves_nothing(kind, pro
         assert (np.asarray(info["episode_steps"]) == step).all()
 
 
-@pytest.mark.parametrize("size", [0.02, 0.0002])
 @pytest.mark.parametrize("name", ["box", "ball"])
-def test_a_load_about_a_middle_that_is_not_zero_is_drawn_between_its_ends(name, size):
+def test_a_load_about_a_middle_that_is_not_zero_is_drawn_between_its_ends(name):
     """The point where its middle rests is rounded, and the bound has room for that in all directions."""
+    size = 0.02
     E = size * np.array([[0.5], [1.0]])
     drawn = {}
     for ends in ((-0.5, 0.5), (0.0, 1.0)):
