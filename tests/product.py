@@ -22,7 +22,6 @@ from ncs_gym.envs.belief import Belief
 from ncs_gym.plants import family as families
 from ncs_gym.uncertainty.ellipsoid import UncertainSet
 from ncs_gym.validation import as_setting
-from shields import Certificate
 from shields.runtime.set_test import PredictedErrors
 
 _SOURCES = (
@@ -264,7 +263,7 @@ def family_of(members: Any, ranges: Any = None, **settings: Any) -> LinearPlant:
     """A plant of which several members, or ranges of parameters, are possible; a function is called in few points."""
 
     def check(*of: Any, whole: Any = families._check_monotone) -> None:
-        with mock.patch.object(families, "grid_size", return_value=6):
+        with mock.patch.object(families, "grid_size", return_value=4):
             whole(*of)
 
     with mock.patch.object(families, "_check_monotone", check):
@@ -277,14 +276,9 @@ def rate_limited(plant: LinearPlant, largest: Any, per: str = "step") -> LinearP
     return replace(plant, limits=replace(plant.limits, rate=rate))
 
 
-def loop_env(plant: LinearPlant, *channel: Any, **settings: Any) -> ncs_gym.NCSEnv:
-    """The environment of one loop."""
-    return ncs_gym.NCSEnv(plant, *channel, **settings)
-
-
-def vector_env(num_envs: int = 1, **settings: Any) -> ncs_gym.NCSVectorEnv:
-    """The environment of several loops."""
-    return ncs_gym.NCSVectorEnv(num_envs, **settings)
+# One loop, several loops, and those that gymnasium makes of a plant or of an id.
+loop_env = ncs_gym.NCSEnv
+vector_env = ncs_gym.NCSVectorEnv
 
 
 def gym_env(env_id: str = "ncs_gym/LinearNCS-v0", **settings: Any) -> gym.Env:
@@ -297,31 +291,11 @@ def gym_vector_env(num_envs: int, env_id: str = "ncs_gym/LinearNCS-v0", **settin
     return gym.make_vec(env_id, num_envs, **settings)
 
 
-def safety_shield(env: gym.Env, *certificate: Any, **settings: Any) -> shields.SafetyShield:
-    """The environment behind a shield."""
-    return shields.SafetyShield(env, *certificate, **settings)
-
-
-def vector_shield(env: gym.vector.VectorEnv, *certificate: Any, **settings: Any) -> shields.VectorSafetyShield:
-    """The vector environment behind a shield."""
-    return shields.VectorSafetyShield(env, *certificate, **settings)
-
-
-def safety_filter(certificate: Certificate, plant: LinearPlant, *mode: Any, **settings: Any) -> shields.SafetyFilter:
-    """The filter that decides on inputs."""
-    return shields.SafetyFilter(certificate, plant, *mode, **settings)
-
-
-def safe_loop(certificate: Certificate, plant: LinearPlant, *channel: Any, **settings: Any) -> shields.SafeLoop:
-    """The controller's side of a loop, whose plant is elsewhere."""
-    return shields.SafeLoop(certificate, plant, *channel, **settings)
-
-
-def synthesize(plant: LinearPlant, **settings: Any) -> Certificate:
-    """A certificate that is made here."""
-    return shields.synthesize(plant, **settings)
-
-
-def paper_synthesis(plant: LinearPlant, **settings: Any) -> Any:
-    """A certificate of the published method that is made here."""
-    return shields.paper.synthesize(plant, **settings)
+# Environments behind a shield, what decides on inputs alone, and the controller's side of a loop.
+safety_shield = shields.SafetyShield
+vector_shield = shields.VectorSafetyShield
+safety_filter = shields.SafetyFilter
+safe_loop = shields.SafeLoop
+# Certificates that are made here, of this method and of the published one.
+synthesize = shields.synthesize
+paper_synthesis = shields.paper.synthesize

@@ -1,4 +1,3 @@
-import copy
 from dataclasses import replace
 
 import gymnasium as gym
@@ -30,14 +29,6 @@ def shield(certificate):
     return ShieldSettings(certificate)
 
 
-@pytest.fixture
-def scalar(monkeypatch):
-    spec = copy.deepcopy(gym.spec(CRUISE.env))
-    spec.id, spec.vector_entry_point = "Scalar-v0", None
-    monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
-    return LoopConfig(env="Scalar-v0")
-
-
 def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
     make_vec, seeds = gym.make_vec, []
 
@@ -66,15 +57,6 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
         assert record.estimate_violation_steps == (np.abs(estimates[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum()
         assert record.times_safe_set == pytest.approx(np.sqrt(max(x @ certificate.M @ x for x in states[:, e])))
         assert not record.guaranteed
-
-
-def test_environments_without_a_vector_one_are_played_alike(scalar, shield):
-    for loop in (scalar, LoopConfig(env=scalar.env, shield=shield)):
-        played = evaluate(loop.with_kwargs(max_episode_steps=60), throttle, 2, 0, shield.certificate.M)
-        shielded = loop.shield is not None
-        assert [record.steps for record in played.episodes] == [60] * 2
-        assert all((record.violation_steps == 0) == shielded for record in played.episodes)
-        assert all(record.guaranteed == shielded for record in played.episodes)
 
 
 def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):

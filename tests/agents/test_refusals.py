@@ -34,17 +34,15 @@ OBSERVED = r"was trained in .* with observations of 3 entries.*shape \(3,\) or \
 # What an algorithm of stable-baselines3 is asked to take, and what is said of it.
 HYPERPARAMS = [
     ("PPO", {"gama": 0.9}, "PPO: unknown hyperparameter 'gama'"),
-    ("SAC", {"gae_lambda": 0.9}, "SAC: unknown hyperparameter 'gae_lambda'"),
-    *(("PPO", {name: value}, f"unknown hyperparameter '{name}'") for name, value in
-      {"noise_std": 0.1, "device": "cuda"}.items()),
-    *(("PPO", {"n_epochs": value}, f"n_epochs must be a whole number >= 1, got {value}") for value in (1.5, 0)),
+    ("PPO", {"device": "cuda"}, "unknown hyperparameter 'device'"),
+    ("PPO", {"n_epochs": 1.5}, "n_epochs must be a whole number >= 1, got 1.5"),
     ("PPO", {"learning_rate": -1.0}, "PPO: Invalid learning rate: -1.0"),
     ("PPO", {"learning_rate": "lin_fast"}, "PPO: could not convert"),
     ("PPO", {"policy_kwargs": {"net_arch": ["64"]}}, "^PPO: "),
     ("SAC", {"replay_buffer_class": "HerReplayBuffer"}, "SAC: .*must be a class"),
     ("PPO", {"policy_kwargs": {"net_arc": [8]}}, "PPO: .*'net_arc'"),
     ("PPO", {"batch_size": 1}, "PPO: .*batch_size"),
-    *(("PPO", {"normalize": value}, "PPO: normalize must be true or") for value in (False, {"norm_obs": False})),
+    ("PPO", {"normalize": {"norm_obs": False}}, "PPO: normalize must be true or"),
     ("PPO", {"normalize": {"gain": 2.0}}, "PPO: normalize: unknown hyperparameter 'gain'"),
     *(("PPO", {"n_envs": value}, "n_envs must be a whole number >= 1") for value in (0, True)),
     ("PPO", {"gamma": 1.5}, r"gamma must be in \[0, 1\], got 1.5"),
@@ -53,7 +51,6 @@ HYPERPARAMS = [
     ("PPO", {"policy_kwargs": {"activation_fn": print}}, "hyperparameters must be JSON values, got {'policy_kwargs': "),
     ("PPO", {"learning_rate": np.nan}, "hyperparameters must be JSON values, got {'learning_rate': nan"),
     ("DQN", {}, "unknown algorithm 'DQN'; known are PPO"),
-    (["PPO"], {}, r"unknown algorithm \['PPO'\]; known are"),
 ]  # fmt: skip
 
 CALLS = [
@@ -80,7 +77,7 @@ CALLS = [
     *((partial(LagrangianSettings, **{name: value}), f"{name} must be >= 0")
       for name in ("cost_limit", "learning_rate", "multiplier") for value in (-0.1, NAN, INF)),
 ]  # fmt: skip
-SHAPES = [(4, 5), (5,), (2, 4, 3), (3, 1), ()]
+SHAPES = [(4, 5), (2, 4, 3), ()]
 
 
 @pytest.mark.parametrize(("algorithm", "change", "words"), HYPERPARAMS)

@@ -9,10 +9,9 @@ import pytest
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines.controllers import controller
-from experiments.baselines.filters import FILTERS, CertaintyEquivalentFilter, EstimateFilterSettings, PredictiveFilter
+from experiments.baselines.filters import CertaintyEquivalentFilter, EstimateFilterSettings, PredictiveFilter
 from ncs_gym.envs.env import ncs_env
 from tests.certificates import certificate_of
-from tests.plants import delayed
 from tests.product import safety_filter, synthesize
 from tests.shields.polytope.limits import PLANTS
 from tests.shields.polytope.limits import certificate as limited
@@ -75,27 +74,6 @@ def test_filter_with_the_tube_of_our_error_sets_keeps_the_box_under_attack():
     attack = {"noise": "extreme", "disturbance": "adversarial", "channel": replace(env.channel, loss=1.0)}
     assert violating(loop, certificate, "psf:tube", **attack) == 0
     assert violating(loop, certificate, "psf", **attack) > 10
-
-
-def test_margin_is_of_what_states_are_off_by_and_not_of_past_inputs():
-    plant = delayed(2)
-    certificate, rng, angles = certificate_of(plant), np.random.default_rng(0), np.arange(0.0, 7.0, 0.05)
-    estimates = rng.uniform(0.5, 1.0, (400, 1)) * certificate.safe_set.sample_boundary(rng, 400)
-    off = np.linalg.cholesky(certificate.L[:2, :2]) @ [np.cos(angles), np.sin(angles)]
-    off = 0.1 * np.vstack([off, np.zeros((2, len(angles)))])
-
-    def level(u):
-        """The largest x'Mx of the next state, with the margin around it, of each estimate."""
-        places = (plant.A @ estimates.T + plant.B @ u.T)[:, :, None] + off[:, None]
-        return np.einsum("isk,ij,jsk->sk", places, certificate.M, places).max(axis=1)
-
-    bearable = np.min([level(np.full((400, 1), u)) for u in np.linspace(-0.8, 0.8, 41)], axis=0) < 0.98
-    largest = {}
-    for name in ("trusting", "trusting:10"):
-        for proposed in (np.full((400, 1), -0.8), np.full((400, 1), 0.8)):
-            u = FILTERS[name](certificate, plant)(estimates, proposed, np.zeros(400, np.bool_))
-            largest[name] = max(largest.get(name, 0.0), level(u)[bearable].max())
-    assert largest["trusting:10"] <= 1.0 + 1e-9 < largest["trusting"]
 
 
 @pytest.mark.parametrize("name", ["trusting", "psf:tube"])
@@ -192,7 +170,7 @@ def test_predictive_filter_applies_the_rest_of_its_plan_and_then_the_gain(certif
 
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
-def test_what_is_not_changed_is_passed_on_bit_for_bit_and_a_reset_counts_nothing(autoreset, certificate):
+def test_what_is_not_changed_is_passed_on_bit_for_bit(autoreset, certificate):
     def steps(wrap):
         envs = wrap(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=5, autoreset_mode=autoreset))
         envs.reset(seed=4)
@@ -205,20 +183,6 @@ def test_what_is_not_changed_is_passed_on_bit_for_bit_and_a_reset_counts_nothing
         np.testing.assert_array_equal(bare[1], behind[1])
         np.testing.assert_array_equal(behind[4]["shield_correction"], 0.0)
         assert not behind[4]["shield_intervened"].any()
-
-    envs = EstimateFilterSettings("trusting", certificate, 2.0)(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
-    free = EstimateFilterSettings("trusting", certificate)(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
-    for each in (envs, free):
-        each.reset(seed=1, options={"state": 0.95 * np.linalg.cholesky(certificate.L)[:, 0]})
-    overridden = 0
-    for k in range(4):
-        actions = np.full((2, 1), 1.0 if k < 3 else -1.0)
-        (_, paid, *_, info), (_, own, *_) = envs.step(actions), free.step(actions)
-        np.testing.assert_allclose(own - paid, 2.0 * info["shield_intervened"])
-        overridden += info["shield_intervened"].sum()
-        if k == 3:
-            assert not info["shield_intervened"].any()
-    assert overridden > 0
 
 
 def test_only_an_environment_with_an_estimate_can_be_filtered(certificate):
