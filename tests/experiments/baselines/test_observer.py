@@ -24,13 +24,13 @@ NETWORKS = {
 }
 
 
-def calm(A, sensor_bound=1e-6, task=None, **settings):
+def calm(A, **settings):
     """A loop whose only disturbance is a push that stays, and whose sensor is as good as exact."""
     plant = linear_plant(
         A=A, B=[[0.05], [0.1]], dt=1.0, box=[1.0, 1.0], u_max=2.0, disturbance_bound=[0.02, 0.02],
-        sensor_bound=sensor_bound, initial_bound=1e-6,
+        sensor_bound=1e-6, initial_bound=1e-6,
     )  # fmt: skip
-    task = task or SetpointTracking(output=np.array([1.0, 0.0]), reach=0.2, width=0.2, change_probability=0.0)
+    task = SetpointTracking(output=np.array([1.0, 0.0]), reach=0.2, width=0.2, change_probability=0.0)
     return loop_env(plant=plant, task=task, disturbance=lambda rng, plant, nominal_next: PUSH, horizon=500, **settings)
 
 

@@ -8,21 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import SMOKE, Run, ncs, without_pictures
+from tests.command import SMOKE, Run, succeeded, without_pictures
 from tests.product import linear_plant
 from tests.workers import no_worker_processes
-
-
-def _made(name: str, command: tuple, made_once: Callable) -> tuple[Path, Run]:
-    def make(folder: Path) -> None:
-        with no_worker_processes(), without_pictures():
-            run = ncs(*command, "--out", folder / "out")
-        (folder / "run.json").write_text(json.dumps(run))
-
-    folder = made_once(name, make)
-    run = Run(*json.loads((folder / "run.json").read_text()))
-    assert run.returncode == 0, run.stderr
-    return folder / "out", run
 
 
 @pytest.fixture
@@ -36,4 +24,11 @@ def plant_file(tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def smoke(made_once: Callable) -> tuple[Path, Run]:
     """The folder of a short comparison, and what it printed; tests that change the folder copy it."""
-    return _made("smoke", SMOKE, made_once)
+
+    def make(folder: Path) -> None:
+        with no_worker_processes(), without_pictures():
+            run = succeeded(*SMOKE, "--out", folder / "out")
+        (folder / "run.json").write_text(json.dumps(run))
+
+    folder = made_once("smoke", make)
+    return folder / "out", Run(*json.loads((folder / "run.json").read_text()))

@@ -90,12 +90,10 @@ def result(returns, violations, interventions=0, index=0):
     return RunResult("arm", index, 100, 4, 20, [], episodes)
 
 
-def summary_of_runs(runs, fixed_policy=False):
-    return arm_summary(runs, None, fixed_policy=fixed_policy)
-
-
 def test_summary_of_an_arm_adds_up():
-    summary = summary_of_runs([result([1.0, 3.0], [0, 2], 5), result([5.0, 7.0], [0, 0], 5, index=1)])
+    summary = arm_summary(
+        [result([1.0, 3.0], [0, 2], 5), result([5.0, 7.0], [0, 0], 5, index=1)], None, fixed_policy=False
+    )
     assert summary["train_steps"] == 200
     assert summary["train_violation_steps"] == 8
     assert summary["train_intervention_rate"] == 0.2
