@@ -196,17 +196,12 @@ def _bounds(bounds: Bounds, described: dict[str, Any], model: Model) -> Bounds:
             noises = [] if noise is None else [Gaussian(noise, 0.05 if delta is None else delta)]
         elif delta is not None:
             noises = [Gaussian(each.covariance, delta) for each in noises]
-        elif name == "sensor":
-            noises = [_fitting(each, len(model.H)) for each in noises]
+        elif name == "sensor" and noises and len(noises[0].covariance) != len(model.H):
+            noises = [Gaussian(each.covariance[0, 0] * np.eye(len(model.H)), each.delta) for each in noises]
         if bound in described:
             others = _others(described.pop(bound), len(model.A) if name == "disturbance" else None)
         made[name] = Sum((*balls, *noises, *others, *left_out))
     return Bounds(**made)
-
-
-def _fitting(noise: Gaussian, p: int) -> Gaussian:
-    """Sensor noise of the library, of as many outputs as there are now."""
-    return noise if len(noise.covariance) == p else Gaussian(noise.covariance[0, 0] * np.eye(p), noise.delta)
 
 
 def _others(value: Any, n: int | None) -> list[Any]:

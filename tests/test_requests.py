@@ -69,19 +69,3 @@ def test_contract_forces_nothing_on_the_best_period_and_everything_on_who_never_
     assert result_of(every(2)).forced == 0.0
     never = result_of(at_random(0.0))
     assert never.forced == never.packets > 0.0
-
-
-def test_margin_is_that_of_the_decision_where_the_proposal_passes():
-    env = environments()
-    asking = Asking(env, weakly_pushing)
-    observations, info = env.reset(seed=0)
-    passed = 0
-    for _ in range(20):
-        margin = asking.see(observations, info).margin
-        action = np.column_stack([asking.proposed, np.ones(COUNT)])
-        observations, *_, info = env.step(action)
-        through = ~info["shield_intervened"]
-        np.testing.assert_allclose(info["shield_margin"][through], margin[through], atol=1e-9)
-        assert (margin[~through] < 1e-6).all()
-        passed += through.sum()
-    assert 0 < passed < 20 * COUNT

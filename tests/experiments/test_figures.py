@@ -7,7 +7,7 @@ from matplotlib.collections import PolyCollection
 
 from experiments import figures
 from experiments.figures import arm_styles, comparison_figures
-from tests.experiments.results import ALL_ARMS, history, run, summary_of
+from tests.experiments.results import history, run, summary_of
 
 
 def arms(*names, runs=2, **change):
@@ -28,14 +28,6 @@ def lines(axis):
 
 def bands(axis):
     return [artist for artist in axis.collections if isinstance(artist, PolyCollection)]
-
-
-def test_all_arms_look_different_and_two_have_colors_of_their_own():
-    looks = arm_styles(ALL_ARMS)
-    assert len({(look.color, str(look.dashes)) for look in looks.values()}) == len(ALL_ARMS)
-    assert len({(look.marker, str(look.dashes)) for look in looks.values()}) == len(ALL_ARMS)
-    two = ["shielded", "unshielded"]
-    assert arm_styles(two) == {name: looks[name] for name in two}
 
 
 def test_training_has_a_line_and_a_band_per_arm_and_interventions_only_of_watching_arms():

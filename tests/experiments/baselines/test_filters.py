@@ -9,9 +9,10 @@ import pytest
 from agents.evaluation import evaluate
 from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines.controllers import controller
-from experiments.baselines.filters import CertaintyEquivalentFilter, EstimateFilterSettings, PredictiveFilter
+from experiments.baselines.filters import FILTERS, CertaintyEquivalentFilter, EstimateFilterSettings, PredictiveFilter
 from ncs_gym.envs.env import ncs_env
 from tests.certificates import certificate_of
+from tests.plants import delayed
 from tests.product import safety_filter, synthesize
 from tests.shields.polytope.limits import PLANTS
 from tests.shields.polytope.limits import certificate as limited
@@ -74,6 +75,27 @@ def test_filter_with_the_tube_of_our_error_sets_keeps_the_box_under_attack():
     attack = {"noise": "extreme", "disturbance": "adversarial", "channel": replace(env.channel, loss=1.0)}
     assert violating(loop, certificate, "psf:tube", **attack) == 0
     assert violating(loop, certificate, "psf", **attack) > 10
+
+
+def test_margin_is_of_what_states_are_off_by_and_not_of_past_inputs():
+    plant = delayed(2)
+    certificate, rng, angles = certificate_of(plant), np.random.default_rng(0), np.arange(0.0, 7.0, 0.05)
+    estimates = rng.uniform(0.5, 1.0, (400, 1)) * certificate.safe_set.sample_boundary(rng, 400)
+    off = np.linalg.cholesky(certificate.L[:2, :2]) @ [np.cos(angles), np.sin(angles)]
+    off = 0.1 * np.vstack([off, np.zeros((2, len(angles)))])
+
+    def level(u):
+        """The largest x'Mx of the next state, with the margin around it, of each estimate."""
+        places = (plant.A @ estimates.T + plant.B @ u.T)[:, :, None] + off[:, None]
+        return np.einsum("isk,ij,jsk->sk", places, certificate.M, places).max(axis=1)
+
+    bearable = np.min([level(np.full((400, 1), u)) for u in np.linspace(-0.8, 0.8, 41)], axis=0) < 0.98
+    largest = {}
+    for name in ("trusting", "trusting:10"):
+        for proposed in (np.full((400, 1), -0.8), np.full((400, 1), 0.8)):
+            u = FILTERS[name](certificate, plant)(estimates, proposed, np.zeros(400, np.bool_))
+            largest[name] = max(largest.get(name, 0.0), level(u)[bearable].max())
+    assert largest["trusting:10"] <= 1.0 + 1e-9 < largest["trusting"]
 
 
 @pytest.mark.parametrize("name", ["trusting", "psf:tube"])
@@ -183,6 +205,19 @@ def test_what_is_not_changed_is_passed_on_bit_for_bit(autoreset, certificate):
         np.testing.assert_array_equal(bare[1], behind[1])
         np.testing.assert_array_equal(behind[4]["shield_correction"], 0.0)
         assert not behind[4]["shield_intervened"].any()
+
+
+def test_every_override_has_its_penalty_and_a_step_that_only_resets_none(certificate):
+    both = []
+    for penalty in (0.0, 2.0):
+        filtered = EstimateFilterSettings("trusting", certificate, penalty)
+        envs = filtered(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
+        envs.reset(seed=1, options={"state": 0.95 * np.linalg.cholesky(certificate.L)[:, 0]})
+        both.append([envs.step(np.full((2, 1), action)) for action in (1.0, 1.0, 1.0, -1.0)])
+    overridden = np.array([info["shield_intervened"] for *_, info in both[1]])
+    np.testing.assert_allclose([free[1] - paid[1] for free, paid in zip(*both, strict=True)], 2.0 * overridden)
+    assert overridden[:3].any()
+    assert not overridden[3].any()
 
 
 def test_only_an_environment_with_an_estimate_can_be_filtered(certificate):
