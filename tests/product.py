@@ -265,10 +265,9 @@ def family_of(members: Any, ranges: Any = None, **settings: Any) -> LinearPlant:
         return ncs_gym.family(members, ranges, **settings)
 
 
-def rate_limited(plant: LinearPlant, largest: Any, per: str = "step") -> LinearPlant:
-    """The plant whose inputs change by so much from one step to the next, or per second, at most."""
-    rate = np.asarray(largest) * (plant.dt if per == "second" else 1.0)
-    return replace(plant, limits=replace(plant.limits, rate=rate))
+def rate_limited(plant: LinearPlant, largest: Any) -> LinearPlant:
+    """The plant whose inputs change by so much from one step to the next at most."""
+    return replace(plant, limits=replace(plant.limits, rate=largest))
 
 
 # One loop, several loops, and those that gymnasium makes of a plant or of an id.

@@ -106,18 +106,3 @@ def test_example_runs_in_a_process_of_its_own_and_prints_what_it_is_about(name, 
 def assert_expected(name, printed):
     for pattern in RUNS[name][1]:
         assert re.search(pattern, printed), f"{pattern!r} is not in {printed!r}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["single_file_ppo.py", "single_file_sac.py"])
-def test_single_files_learn_and_break_the_coupling_only_without_a_shield(name, tmp_path):
-    budget = {"single_file_ppo.py": "40960", "single_file_sac.py": "6000"}[name]
-    bare, shielded = (
-        run_example(name, "--shield", shield, "--total-timesteps", budget, cwd=tmp_path)
-        for shield in ("none", "project")
-    )
-    assert bare.returncode == shielded.returncode == 0, bare.stderr + shielded.stderr
-    assert re.search(r"violating steps: [1-9]", bare.stdout), bare.stdout
-    assert "violating steps: 0;" in shielded.stdout
-    # A random policy returns -100 or so, the zero input -68 (README).
-    assert float(re.search(r"episodes: (-[\d.]+)", shielded.stdout)[1]) > -50.0

@@ -129,6 +129,12 @@ def test_a_foreign_agent_names_no_file_as_its_plant(folder, tmp_path):
         Agent.load(folder)
 
 
+def test_training_whose_agent_cannot_be_saved_is_told_so_before_it():
+    loop = LoopConfig(env=CRUISE, kwargs={"autoreset_mode": "SameStep"})
+    with pytest.warns(UserWarning, match="the agent cannot be saved: files of agents do not keep autoreset_mode"):
+        train(loop, 32, 0, hyperparams={"n_envs": 2, "n_steps": 16, "batch_size": 8})
+
+
 def test_certificate_of_another_plant_is_not_saved(agent, tmp_path):
     other = certificate_of(truck_trailer())
     with pytest.raises(ValueError, match="another plant"):
@@ -183,6 +189,7 @@ SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
     [
         (lambda folder: (folder / "agent.json").unlink(), "No such file"),
         (lambda folder: (folder / "agent.json").write_text("{"), "not valid JSON"),
+        (lambda folder: (folder / "agent.json").write_text("[]"), "not of format"),
         (lambda folder: (folder / "agent.json").write_text('{"format": "ncs-gym agent 3"}'), "is not the one that"),
         (lambda folder: (folder / "model.zip").write_bytes(b"PK"), "is not the one that"),
         (lambda folder: rewrite(folder, b"PK"), "wasn't a zip-file"),

@@ -1,3 +1,4 @@
+import copy
 from dataclasses import replace
 
 import gymnasium as gym
@@ -57,6 +58,15 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
         assert record.estimate_violation_steps == (np.abs(estimates[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum()
         assert record.times_safe_set == pytest.approx(np.sqrt(max(x @ certificate.M @ x for x in states[:, e])))
         assert not record.guaranteed
+
+
+def test_environments_without_a_vector_one_are_played_alike(shield, monkeypatch):
+    spec = copy.deepcopy(gym.spec(CRUISE.env))
+    spec.id, spec.vector_entry_point = "Scalar-v0", None
+    monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
+    loop = LoopConfig(env="Scalar-v0", kwargs={"max_episode_steps": 60}, shield=shield)
+    for record in evaluate(loop, throttle, 2, 0, shield.certificate.M).episodes:
+        assert (record.steps, record.violation_steps, record.guaranteed) == (60, 0, True)
 
 
 def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):

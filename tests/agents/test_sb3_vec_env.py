@@ -129,6 +129,7 @@ def test_attributes():
     assert env.get_attr("plant", [0, 2]) == [shield.unwrapped.plant] * 2
     assert env.get_attr("mode") == ["switch"] * 3
     assert env.env_is_wrapped(Monitor) == [True] * 3
+    assert env.get_images() == [None] * 3
     assert env.env_is_wrapped(VectorSafetyShield, 1) == [True]
     assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False] * 3
     for call in (

@@ -59,6 +59,7 @@ USAGE = [
     ("compare --steps 0", "--steps must be at least 1"),
     ("compare --hyperparams gamma", "expected NAME=VALUE"),
     ("compare --channel loss=0.1 loss=0.2", "loss is given twice"),
+    ("compare --channel loss=[64", "expected loss=VALUE with a word or a JSON value"),
     ("evaluate nowhere --episodes 0", "--episodes must be at least 1"),
     ("evaluate nowhere --shield project --horizon 6", "--horizon 6 is for mode lookahead"),
     ("render --side-by-side --shield none", "--side-by-side compares with a shield"),

@@ -79,6 +79,11 @@ def test_own_plant_is_attacked_on_its_channel_and_without_any_packet(folder, mon
     assert_one_sentence(ncs("attack", "--env", "own_plants:Plants/Other-v0", cwd=folder), "Plants/Other-v0")
 
 
+def test_error_of_the_module_itself_is_told(folder):
+    (folder / "own_plants.py").write_text("import something_that_is_missing")
+    assert_one_sentence(ncs("synthesize", *ENV, cwd=folder), "something_that_is_missing")
+
+
 def test_plant_of_a_file_under_a_contract(plant_file, tmp_path):
     asked = ("--plant", plant_file.name, "--max-age", 2, "--quantization-step", 0.001)
     assert ncs("synthesize", *asked, cwd=tmp_path).returncode == 0
