@@ -79,8 +79,7 @@ SLOW_PART ?= tests/shields/test_packaged_certificates.py tests/experiments/comma
 	tests/hardening/test_determinism.py::test_same_seed_gives_the_same_bits_in_every_process \
 	tests/hardening/test_portability.py::test_operating_points_that_are_found_are_the_same_under_other_kernels \
 	tests/experiments/backends/test_execution.py \
-	tests/test_packaging.py tests/ncs_gym/rendering/test_rendering.py::test_images_need_no_display_and_leave_the_driver_alone \
-	tests/experiments/commands/test_attack.py::test_lookahead_may_leave_the_safe_set_and_keeps_the_box
+	tests/test_packaging.py tests/ncs_gym/rendering/test_rendering.py::test_images_need_no_display_and_leave_the_driver_alone
 test-slow-part: $(INSTALLED) ## a fixed part of the long tests
 	$(BIN)/python -m pytest -n auto --dist worksteal -m slow $(SLOW_PART)
 

@@ -19,8 +19,9 @@ from experiments.__main__ import main
 ROOT = Path(__file__).resolve().parent.parent
 # A command whose files many tests look at (the fixture `smoke`), whose unshielded agents explore enough to violate in
 # training.
-SMOKE = ("compare", "--smoke", "--arms", "unshielded", "shielded", "--baselines", "zero input", "lqr+shielded")
-SMOKE += ("--hyperparams", 'policy_kwargs={"log_std_init": 0.0}', "n_epochs=2")
+SMOKE = ("compare", "--seeds", 2, "--steps", 2048, "--episodes", 5)
+SMOKE += ("--arms", "unshielded", "shielded", "--baselines", "zero input", "lqr+shielded")
+SMOKE += ("--hyperparams", 'policy_kwargs={"log_std_init": 0.0}', "n_epochs=2", "n_steps=16")
 
 
 class Run(NamedTuple):

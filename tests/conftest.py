@@ -23,6 +23,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
+# Nor does it walk through what is being imported, of which nothing is garbage.
+gc.set_threshold(100_000, 50, 100)
+
 if TYPE_CHECKING:
     from ncs_gym import LinearPlant
     from shields import Certificate
@@ -50,7 +53,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """What is imported by now stays: the collector of garbage does not walk through it again and again."""
     gc.freeze()
-    gc.set_threshold(100_000, 50, 100)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -22,7 +22,6 @@ from ncs_gym.envs.belief import Belief
 from ncs_gym.plants import family as families
 from ncs_gym.uncertainty.ellipsoid import UncertainSet
 from ncs_gym.validation import as_setting
-from shields import Certificate
 from shields.runtime.set_test import PredictedErrors
 
 _SOURCES = (
@@ -197,17 +196,12 @@ def _bounds(bounds: Bounds, described: dict[str, Any], model: Model) -> Bounds:
             noises = [] if noise is None else [Gaussian(noise, 0.05 if delta is None else delta)]
         elif delta is not None:
             noises = [Gaussian(each.covariance, delta) for each in noises]
-        elif name == "sensor":
-            noises = [_fitting(each, len(model.H)) for each in noises]
+        elif name == "sensor" and noises and len(noises[0].covariance) != len(model.H):
+            noises = [Gaussian(each.covariance[0, 0] * np.eye(len(model.H)), each.delta) for each in noises]
         if bound in described:
             others = _others(described.pop(bound), len(model.A) if name == "disturbance" else None)
         made[name] = Sum((*balls, *noises, *others, *left_out))
     return Bounds(**made)
-
-
-def _fitting(noise: Gaussian, p: int) -> Gaussian:
-    """Sensor noise of the library, of as many outputs as there are now."""
-    return noise if len(noise.covariance) == p else Gaussian(noise.covariance[0, 0] * np.eye(p), noise.delta)
 
 
 def _others(value: Any, n: int | None) -> list[Any]:
@@ -264,27 +258,21 @@ def family_of(members: Any, ranges: Any = None, **settings: Any) -> LinearPlant:
     """A plant of which several members, or ranges of parameters, are possible; a function is called in few points."""
 
     def check(*of: Any, whole: Any = families._check_monotone) -> None:
-        with mock.patch.object(families, "grid_size", return_value=6):
+        with mock.patch.object(families, "grid_size", return_value=4):
             whole(*of)
 
     with mock.patch.object(families, "_check_monotone", check):
         return ncs_gym.family(members, ranges, **settings)
 
 
-def rate_limited(plant: LinearPlant, largest: Any, per: str = "step") -> LinearPlant:
-    """The plant whose inputs change by so much from one step to the next, or per second, at most."""
-    rate = np.asarray(largest) * (plant.dt if per == "second" else 1.0)
-    return replace(plant, limits=replace(plant.limits, rate=rate))
+def rate_limited(plant: LinearPlant, largest: Any) -> LinearPlant:
+    """The plant whose inputs change by so much from one step to the next at most."""
+    return replace(plant, limits=replace(plant.limits, rate=largest))
 
 
-def loop_env(plant: LinearPlant, *channel: Any, **settings: Any) -> ncs_gym.NCSEnv:
-    """The environment of one loop."""
-    return ncs_gym.NCSEnv(plant, *channel, **settings)
-
-
-def vector_env(num_envs: int = 1, **settings: Any) -> ncs_gym.NCSVectorEnv:
-    """The environment of several loops."""
-    return ncs_gym.NCSVectorEnv(num_envs, **settings)
+# One loop, several loops, and those that gymnasium makes of a plant or of an id.
+loop_env = ncs_gym.NCSEnv
+vector_env = ncs_gym.NCSVectorEnv
 
 
 def gym_env(env_id: str = "ncs_gym/LinearNCS-v0", **settings: Any) -> gym.Env:
@@ -297,31 +285,11 @@ def gym_vector_env(num_envs: int, env_id: str = "ncs_gym/LinearNCS-v0", **settin
     return gym.make_vec(env_id, num_envs, **settings)
 
 
-def safety_shield(env: gym.Env, *certificate: Any, **settings: Any) -> shields.SafetyShield:
-    """The environment behind a shield."""
-    return shields.SafetyShield(env, *certificate, **settings)
-
-
-def vector_shield(env: gym.vector.VectorEnv, *certificate: Any, **settings: Any) -> shields.VectorSafetyShield:
-    """The vector environment behind a shield."""
-    return shields.VectorSafetyShield(env, *certificate, **settings)
-
-
-def safety_filter(certificate: Certificate, plant: LinearPlant, *mode: Any, **settings: Any) -> shields.SafetyFilter:
-    """The filter that decides on inputs."""
-    return shields.SafetyFilter(certificate, plant, *mode, **settings)
-
-
-def safe_loop(certificate: Certificate, plant: LinearPlant, *channel: Any, **settings: Any) -> shields.SafeLoop:
-    """The controller's side of a loop, whose plant is elsewhere."""
-    return shields.SafeLoop(certificate, plant, *channel, **settings)
-
-
-def synthesize(plant: LinearPlant, **settings: Any) -> Certificate:
-    """A certificate that is made here."""
-    return shields.synthesize(plant, **settings)
-
-
-def paper_synthesis(plant: LinearPlant, **settings: Any) -> Any:
-    """A certificate of the published method that is made here."""
-    return shields.paper.synthesize(plant, **settings)
+# Environments behind a shield, what decides on inputs alone, and the controller's side of a loop.
+safety_shield = shields.SafetyShield
+vector_shield = shields.VectorSafetyShield
+safety_filter = shields.SafetyFilter
+safe_loop = shields.SafeLoop
+# Certificates that are made here, of this method and of the published one.
+synthesize = shields.synthesize
+paper_synthesis = shields.paper.synthesize

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import learning, networks, project
+from benchmarks import networks
 from benchmarks.commands import run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -52,44 +52,10 @@ def test_docstring_of_a_module_names_its_commands_which_start_without_options(na
         assert asked_for(name, each).replace("_", "-") == each
 
 
-def test_lines_and_data_are_counted_without_what_is_proved_or_trained():
-    folders = [path.read_text().count("\n") for path in (ROOT / "tests").rglob("*.py")]
-    assert project.lines(project.sources("tests")) == sum(folders)
-    names = {path.name for path in project.templates_and_data()}
-    assert {"comparison.html.j2", "style.css", "ppo.json", "tuned.json", "cart_pole_nonlinear.json"} <= names
-    assert not {"agent.json", "CSTR-v0.json"} & names
-
-
-def test_search_chooses_the_weights_that_return_most_and_measures_nothing_twice(tmp_path, monkeypatch, capsys):
-    tries = [{"effort": effort, "state": 0.003, "disturbance": 0.2} for effort in (3.0, 0.03)]
-    monkeypatch.setattr(learning, "grid", lambda arm: tries)
-    given = {"tasks": ("CSTR-v0",), "arms": ("lqr:observer",), "episodes": 2, "out": tmp_path / "found.jsonl"}
-    learning.tune_arms(**given)
-    first = capsys.readouterr().out
-    best, worse, better = re.search(r"observer: ([\d.]+) with .*, of ([\d.]+), ([\d.]+)$", first, re.MULTILINE).groups()
-    assert float(worse) < float(better) == float(best)
-    assert str(tries[1]) in first
-    monkeypatch.setattr(learning, "evaluate", None)
-    learning.tune_arms(**given)
-    assert capsys.readouterr().out == first
-
-
 def test_an_hour_without_an_end_says_what_it_rules_out():
     assert networks.Measured(0, 1.0, 1.0).interval == pytest.approx((0.0, -np.log(0.025)))
     low, high = networks.Measured(40, 2.0, 1.0).interval  # 40 ends: Garwood's interval is [28.58, 54.47]
     assert (low, high) == pytest.approx((28.58 / 2.0, 54.47 / 2.0), abs=5e-3)
-
-
-@pytest.mark.parametrize("drive", [networks.RURAL, networks.URBAN])
-def test_packets_of_a_drive_wait_and_arrive_in_order_as_in_the_records_it_was_fitted_to(drive):
-    sent = 0.05 * np.arange(round(networks.SPAN / 0.05))
-    records = [(sent, sent + drive.delays(np.random.default_rng(seed), sent)) for seed in range(8)]
-    assert all((np.diff(arrived) > 0.0).all() for _, arrived in records)
-    found = networks.Drive.of(records)
-    assert found.stalls == pytest.approx(drive.stalls, rel=0.1)
-    assert np.log([found.shortest / drive.shortest, found.longest / drive.longest]) == pytest.approx(0.0, abs=0.25)
-    stalled = sum(networks.stalls_of(*each).sum() for each in records) / (8.0 * networks.SPAN)
-    assert stalled == pytest.approx({1352: 0.37, 34: 0.003}[drive.stalls], rel=0.15)
 
 
 def test_the_fixed_part_of_the_long_tests_exists():

@@ -31,16 +31,8 @@ QUICK_PAGES = (
     "docs/networked.md",
     "docs/lookahead.md",
 )
-# Their programs run in a process of their own; some train an agent, or synthesize certificates that take seconds.
-SLOW_PAGES = (
-    *QUICK_PAGES,
-    "docs/contracts.md",
-    "docs/requests.md",
-    "docs/own_plant.md",
-    "docs/deployment.md",
-    "docs/agents.md",
-    "docs/beyond_linear.md",
-)
+# Their programs run in a process of their own, but for those of the benchmark, which take hours.
+SLOW_PAGES = {str(page.relative_to(ROOT)) for page in PAGES if PROGRAM.search(page.read_text())} - {"docs/benchmark.md"}
 MODULE = re.compile(rf"\b(?:{'|'.join(PACKAGES)}|tests|benchmarks)/[\w/]+\.py\b")
 
 
@@ -161,7 +153,7 @@ def test_programs_of_a_page_that_train_nothing_print_what_follows_them(page):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", SLOW_PAGES)
+@pytest.mark.parametrize("page", sorted(SLOW_PAGES))
 def test_programs_of_a_page_print_what_follows_them_in_a_process_of_their_own(page, tmp_path):
     programs = PROGRAM.findall((ROOT / page).read_text())
     run = subprocess.run(

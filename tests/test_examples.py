@@ -16,40 +16,14 @@ NUMBER = r"-?[\d.,]+"
 
 # Arguments of a tiny run, and what has to stand in its output.
 RUNS = {
-    "both_directions.py": (
-        [],
-        [
-            "decided 3 steps ahead; applied as decided: 3000 of 3000",
-            r"closest to the limit: 0\.\d+",
-            "proved: 3000 of 3000 steps",
-        ],
-    ),
+    "both_directions.py": ([], ["applied as decided: 3000 of 3000", "proved: 3000 of 3000 steps"]),
     "change_the_channel.py": ([], [rf"{re.escape('30 % lost, 2 steps late')} +root mean square error {NUMBER}"]),
-    "loggers.py": (
-        ["--steps", "1024"],
-        [r"TensorBoard: safety/violation_rate 0\.000 safety/intervention_rate 0\.[1-9]"],
-    ),
-    "lost_hour.py": (
-        [],
-        [
-            "proved in 9600 of 9600 steps, outside the box in 0; now: True",
-            r"proved in 24\d\d of 9600 steps, outside the box in 0; now: True",
-            "where it was not proved: the newest sample used is older",
-        ],
-    ),
-    "delayed_classics.py": (
-        ["--smoke", "--only", "CartPole-v1"],
-        [rf"CartPole +PPO +bursts +{NUMBER} +{NUMBER}"],
-    ),
+    "loggers.py": (["--steps", "1024"], [r"violation_rate 0\.000 safety/intervention_rate 0\.[1-9]"]),
+    "lost_hour.py": ([], [rf"proved in {share} of 9600 steps, outside the box in 0" for share in ("9600", r"24\d\d")]),
+    "delayed_classics.py": (["--smoke", "--only", "CartPole-v1"], [rf"CartPole +PPO +bursts +{NUMBER} +{NUMBER}"]),
     "pettingzoo_network.py": ([], [rf"both see three steps late: {NUMBER}"]),
-    "mpc_loop.py": (
-        [],
-        [r"monitor: outside the box in [1-9]\d* steps", r"project: outside the box in 0 steps, [1-9].* in 300 of 300"],
-    ),
-    "own_plant.py": (
-        ["--steps", "12800"],
-        ["largest angle in the safe set: 0.500 rad", "without a violation: 64 of 64"],
-    ),
+    "mpc_loop.py": ([], [r"monitor: outside the box in [1-9]", r"project: outside the box in 0 .* in 300 of 300"]),
+    "own_plant.py": (["--steps", "12800"], ["without a violation: 64 of 64"]),
     "plain_loop.py": ([], [r"overridden: \d+ of 1000; closest to the limit: 0\.\d+", "proved to be safe: True"]),
     "quick_start.py": ([], ["violating steps: 0", r"overridden actions: [1-9]", "the proof held: True"]),
     "random_networks.py": (
@@ -57,59 +31,28 @@ RUNS = {
         [rf"trained on the {name}, worst network: return {NUMBER}, violating steps: 0" for name in ("best", "range")],
     ),
     "recurrent_ppo.py": (["--steps", "1024"], [rf"mean return of the last 4 episodes: {NUMBER}", "violating steps: 0"]),
-    "quadruple_tank.py": (
-        [],
-        [
-            r"without a shield: [1-9]\d+ of 400 steps outside",
-            r"with a shield: 0 of 400 steps outside, levels \[cm\] \d",
-            r"0 <= level 3 <= 20 cm \(operating point 1.8\)",
-        ],
-    ),
-    "servo_requirements.py": (
-        [],
-        [
-            "a step of 0.005 s: max_age = 6",
-            "a step of 0.02 s: max_age = 1",
-        ],
-    ),
+    "quadruple_tank.py": ([], [r"without a shield: [1-9]\d+ of 400", "with a shield: 0 of 400 steps outside"]),
+    "servo_requirements.py": ([], ["a step of 0.005 s: max_age = 6", "a step of 0.02 s: max_age = 1"]),
     "sb3_ten_lines.py": (
         ["--steps", "210"],
         [rf"{name}: last return {NUMBER}; 0 violating steps, [1-9]\d* actions" for name in ("PPO", "SAC", "TD3")],
     ),
-    "minari_dataset.py": (
-        [],
-        [re.escape("600 steps in 3 episodes; violating steps of each: [0.0, 0.0, 0.0]"), "those applied: True"],
-    ),
+    "minari_dataset.py": ([], [r"steps of each: \[0\.0, 0\.0, 0\.0\]", "those applied: True"]),
     "sb3_processes.py": ([], [r"10 episodes, violating steps: 0\b"]),
     "single_file_ppo.py": (
         ["--total-timesteps", "512", "--num-envs", "2", "--epochs", "2"],
-        [rf"last 2 of 2 episodes: {NUMBER}", r"violating steps: 0; actions overridden: [1-9]"],
+        ["violating steps: 0; actions overridden: [1-9]"],
     ),
     "single_file_sac.py": (
         ["--total-timesteps", "420", "--learning-starts", "390"],
-        [rf"last 2 of 2 episodes: {NUMBER}", r"violating steps: 0; actions overridden: [1-9]"],
+        ["violating steps: 0; actions overridden: [1-9]"],
     ),
-    "tianshou_processes.py": (
-        [],
-        [rf"full throttle: \[{NUMBER} {NUMBER}\]; {re.escape('violating steps: [0.0, 0.0]')}"],
-    ),
+    "tianshou_processes.py": ([], [r"violating steps: \[0\.0, 0\.0\]"]),
     "torch_tensors.py": ([], [r"update 100: mean action applied 0\.\d+, [1-4]\d\d of 500 pass as they are"]),
     "torchrl_rollout.py": ([], [rf"return of 200 random steps: {NUMBER}; violating steps: 0\b"]),
-    "udp_loop.py": (
-        [],
-        [
-            r"no command in time: [1-9]\d* steps",
-            r"proved: \d+ of 140 steps; now: False, the downlink broke its contract: an input decided earlier",
-        ],
-    ),
-    "unstable_plant_loop.py": (
-        [],
-        ["oldest sample in use: 4 steps, allowed: 4", r"closest to the limit: 0\.\d+", "proved: 5000 of 5000 steps"],
-    ),
-    "your_gym_env.py": (
-        ["--steps", "4096"],
-        ["assumed to lie in its bound", rf"episodes without a violation: 16 of 16; mean return {NUMBER}"],
-    ),
+    "udp_loop.py": ([], [r"no command in time: [1-9]", r"proved: \d+ of 140 steps; now: False, the downlink broke"]),
+    "unstable_plant_loop.py": ([], ["in use: 4 steps, allowed: 4", "proved: 5000 of 5000 steps"]),
+    "your_gym_env.py": (["--steps", "4096"], ["episodes without a violation: 16 of 16"]),
     "wifi_record.py": ([], ["packets.csv: 360,000 packets, 76 stalls in 14 clusters"]),
     "write_a_task.py": ([], [rf"return of doing nothing: {NUMBER}"]),
 }
@@ -163,18 +106,3 @@ def test_example_runs_in_a_process_of_its_own_and_prints_what_it_is_about(name, 
 def assert_expected(name, printed):
     for pattern in RUNS[name][1]:
         assert re.search(pattern, printed), f"{pattern!r} is not in {printed!r}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["single_file_ppo.py", "single_file_sac.py"])
-def test_single_files_learn_and_break_the_coupling_only_without_a_shield(name, tmp_path):
-    budget = {"single_file_ppo.py": "40960", "single_file_sac.py": "6000"}[name]
-    bare, shielded = (
-        run_example(name, "--shield", shield, "--total-timesteps", budget, cwd=tmp_path)
-        for shield in ("none", "project")
-    )
-    assert bare.returncode == shielded.returncode == 0, bare.stderr + shielded.stderr
-    assert re.search(r"violating steps: [1-9]", bare.stdout), bare.stdout
-    assert "violating steps: 0;" in shielded.stdout
-    # A random policy returns -100 or so, the zero input -68 (README).
-    assert float(re.search(r"episodes: (-[\d.]+)", shielded.stdout)[1]) > -50.0

@@ -13,7 +13,7 @@ from ncs_gym.estimation.error_bound import certified_error_set
 from shields import Infeasible
 from shields.synthesis.resting_point import farthest_equilibrium
 from tests.certificates import certificate_of
-from tests.product import altered, linear_plant, synthesize, vector_env, vector_shield
+from tests.product import altered, synthesize, vector_env, vector_shield
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS
 
 
@@ -33,28 +33,6 @@ def test_no_limit_is_broken_under_attack_and_all_are_without_the_shield(name):
     assert counts["outside S"] == counts["outside box"] == counts["no claim"] == 0
     assert counts["overridden"] > 400
     assert counts_of("monitor")["outside box"] > 400
-
-
-@pytest.mark.slow
-def test_a_plant_has_a_row_of_its_share_and_one_of_its_attack(capsys, monkeypatch):
-    certificate = script.certified("ctms_cruise", script.plant_of("ctms_cruise"))
-    monkeypatch.setattr(script, "certified", lambda *_: certificate)
-    script.shares(("ctms_cruise",))
-    script.attack(("ctms_cruise",), steps=600)
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[1].split()[:8] == ["ctms_cruise", "1,", "1", "1", "two", "ends", "1.000", "1.00"]
-    assert printed[2] == "1 of 1 have a certificate"
-    assert printed[4].split() == ["ctms_cruise", "600", "0", "0", "0"]
-    assert printed[5] == "0 of 600 attacked steps left a set or broke a limit"
-
-
-@pytest.mark.slow
-def test_largest_share_is_where_an_input_can_still_turn_the_state_round():
-    """x+ = 1.25 x + u with |u| <= 1: from |x| <= 4; that of the other state is kept, whatever the sign of its row."""
-    exact = {"dt": 0.1, "disturbance_bound": 0.01, "sensor_bound": 0.0, "initial_bound": 0.0}
-    plant = linear_plant(A=np.diag([1.25, 0.5]), B=np.eye(2, 1), box=np.diag([0.1, -1.0]), u_max=1.0, **exact)
-    assert script.largest_share(plant) == pytest.approx(0.4, abs=0.01)
-    assert script.largest_share(altered(plant, box=np.array([[0.1, 0.0]]))) is None
 
 
 def test_no_controller_bears_what_noise_hides_and_a_certificate_bears_less():
@@ -84,14 +62,6 @@ def test_no_controller_bears_a_constant_disturbance_that_no_equilibrium_balances
     assert isinstance(most, Fraction)
     assert float(most) == pytest.approx(2.5, rel=1e-9)  # the other state, which no input moves, needs |d| <= .5
     assert float(script.impossible_beyond(bounded_by(1.0, [[1.0], [0.0]]), np.zeros(2), 2)) == pytest.approx(3.0)
-
-
-@pytest.mark.slow
-def test_a_rocket_is_refused_for_what_no_controller_can_bear(capsys):
-    """A constant gust takes its angle of attack to 1.03 of the limit."""
-    script.impossible(("tvc_rocket", "ctms_cruise"))
-    printed = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert printed[1:] == [["tvc_rocket", "0.971"], ["ctms_cruise", "5.500"]]
 
 
 @pytest.mark.slow

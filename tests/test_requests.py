@@ -1,15 +1,11 @@
 """Policies that ask for samples: what they ask for, what the contract adds, and what is counted."""
 
-import subprocess
-import sys
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from benchmarks.requests import (
     Asking,
-    RequestsOnly,
     acknowledged,
     at_random,
     best_period,
@@ -20,7 +16,6 @@ from benchmarks.requests import (
 )
 from ncs_gym import Channel, ChannelContract, VectorRequestActions
 from tests.certificates import certificate_of
-from tests.command import environment
 from tests.product import vector_shield
 
 ID, COUNT, STEPS = "ncs_gym/LaneKeepingOnRequest-v0", 12, 44
@@ -74,42 +69,3 @@ def test_contract_forces_nothing_on_the_best_period_and_everything_on_who_never_
     assert result_of(every(2)).forced == 0.0
     never = result_of(at_random(0.0))
     assert never.forced == never.packets > 0.0
-
-
-def test_margin_is_that_of_the_decision_where_the_proposal_passes():
-    env = environments()
-    asking = Asking(env, weakly_pushing)
-    observations, info = env.reset(seed=0)
-    passed = 0
-    for _ in range(20):
-        margin = asking.see(observations, info).margin
-        action = np.column_stack([asking.proposed, np.ones(COUNT)])
-        observations, *_, info = env.step(action)
-        through = ~info["shield_intervened"]
-        np.testing.assert_allclose(info["shield_margin"][through], margin[through], atol=1e-9)
-        assert (margin[~through] < 1e-6).all()
-        passed += through.sum()
-    assert 0 < passed < 20 * COUNT
-
-
-def test_agent_that_only_asks_sees_the_margin_and_leaves_the_inputs_to_the_controller():
-    env = environments()
-    only = RequestsOnly(Asking(env, weakly_pushing), env)
-    observations, _ = only.reset(seed=0)
-    assert only.observation_space.contains(observations)
-    assert only.action_space.shape == (COUNT, 1)
-    for _ in range(10):
-        observations, *_, info = only.step(np.full((COUNT, 1), -1.0))
-        assert only.observation_space.contains(observations)
-        assert info["input_proposed"] == pytest.approx(0.3 * env.unwrapped.plant.u_max.item())
-    assert info["requested"].sum() == info["request_forced"].sum()
-
-
-@pytest.mark.slow
-def test_command_prints_a_table_and_draws_a_figure(tmp_path):
-    command = [sys.executable, "-m", "benchmarks.networks", "requests", "--episodes", "3", "--steps", "0"]
-    command += ["--out", "figure.png"]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, env=environment())
-    assert "At this price the winner is " in run.stdout
-    assert "period 2, the best" in run.stdout
-    assert (tmp_path / "figure.png").stat().st_size > 10_000

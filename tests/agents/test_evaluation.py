@@ -30,14 +30,6 @@ def shield(certificate):
     return ShieldSettings(certificate)
 
 
-@pytest.fixture
-def scalar(monkeypatch):
-    spec = copy.deepcopy(gym.spec(CRUISE.env))
-    spec.id, spec.vector_entry_point = "Scalar-v0", None
-    monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
-    return LoopConfig(env="Scalar-v0")
-
-
 def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
     make_vec, seeds = gym.make_vec, []
 
@@ -47,14 +39,7 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
             return self.env.reset(seed=seed, options=options)
 
     monkeypatch.setattr(gym, "make_vec", lambda *given, **settings: Noting(make_vec(*given, **settings)))
-    played = evaluate(
-        CRUISE,
-        throttle,
-        8,
-        100,
-        safe_set=certificate.safe_set,
-        on_progress=(reported := []).append,
-    )
+    played = evaluate(CRUISE, throttle, 8, 100, safe_set=certificate.safe_set, on_progress=(reported := []).append)
     assert sum(reported) == 8 * 200
     envs = make_vec(CRUISE.env, num_envs=8)
     plant = envs.unwrapped.plant
@@ -75,19 +60,13 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
         assert not record.guaranteed
 
 
-def test_environments_without_a_vector_one_are_played_alike(scalar, shield):
-    for loop in (scalar, LoopConfig(env=scalar.env, shield=shield)):
-        played = evaluate(
-            loop.with_kwargs(max_episode_steps=60),
-            throttle,
-            2,
-            0,
-            shield.certificate.safe_set,
-        )
-        shielded = loop.shield is not None
-        assert [record.steps for record in played.episodes] == [60] * 2
-        assert all((record.violation_steps == 0) == shielded for record in played.episodes)
-        assert all(record.guaranteed == shielded for record in played.episodes)
+def test_environments_without_a_vector_one_are_played_alike(shield, monkeypatch):
+    spec = copy.deepcopy(gym.spec(CRUISE.env))
+    spec.id, spec.vector_entry_point = "Scalar-v0", None
+    monkeypatch.setitem(gym.registry, "Scalar-v0", spec)
+    loop = LoopConfig(env="Scalar-v0", kwargs={"max_episode_steps": 60}, shield=shield)
+    for record in evaluate(loop, throttle, 2, 0, shield.certificate.safe_set).episodes:
+        assert (record.steps, record.violation_steps, record.guaranteed) == (60, 0, True)
 
 
 def test_it_is_guaranteed_behind_a_shield_and_leaves_penalties_out(shield):

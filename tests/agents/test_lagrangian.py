@@ -1,13 +1,10 @@
 """PPO-Lagrangian's price of a violation."""
 
-import gymnasium as gym
 import pytest
 
 from agents.callbacks import DualAscentCallback
 from agents.loop import CostPenalty, LagrangianSettings, LoopConfig
 from agents.training import train
-from ncs_gym import truck_trailer
-from tests.product import loop_env
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 TINY = dict(n_envs=4, n_steps=50, batch_size=200, n_epochs=1, policy_kwargs=dict(net_arch=[8, 8]))
@@ -62,23 +59,14 @@ def test_multiplier_climbs_by_the_cost_of_a_full_episode_at_the_rate_of_the_roll
 
 
 def test_an_episode_is_as_long_as_the_environment_says():
-    gym.register(
-        "Own50-v0", entry_point=lambda **kwargs: loop_env(truck_trailer(mass=4000.0), **kwargs), max_episode_steps=50
-    )
-    gym.register("OwnWithoutEnd-v0", entry_point=lambda **kwargs: loop_env(truck_trailer(), **kwargs))
     settings = LagrangianSettings(cost_limit=2.0, multiplier=1.0)
-    for env, kwargs, steps in (
-        ("Own50-v0", {}, 50),
-        (CRUISE.env, {"max_episode_steps": 40}, 40),
-    ):
-        loop = LoopConfig(env=env, kwargs=kwargs, lagrangian=settings)
-        assert loop.episode_steps == steps
-        history = train(loop, 400, 0, hyperparams=TINY).history
-        price, before = settings.multiplier, 0
-        for point in history:
-            cost = (point.violation_steps - before) / 200 * steps
-            price, before = max(0.0, price + settings.learning_rate * (cost - 2.0)), point.violation_steps
-            assert point.multiplier == pytest.approx(price)
-        assert len(history) == 2  # a rollout is shorter than an episode
-    with pytest.raises(ValueError, match="OwnWithoutEnd-v0 has no max_episode_steps"):
-        LoopConfig(env="OwnWithoutEnd-v0", lagrangian=settings)
+    loop = LoopConfig(env=CRUISE.env, kwargs={"max_episode_steps": 40}, lagrangian=settings)
+    history = train(loop, 400, 0, hyperparams=TINY).history
+    price, before = settings.multiplier, 0
+    for point in history:
+        cost = (point.violation_steps - before) / 200 * 40
+        price, before = max(0.0, price + settings.learning_rate * (cost - 2.0)), point.violation_steps
+        assert point.multiplier == pytest.approx(price)
+    assert len(history) == 2
+    with pytest.raises(ValueError, match="has no max_episode_steps"):
+        LoopConfig(env=CRUISE.env, kwargs={"max_episode_steps": -1}, lagrangian=settings)

@@ -13,47 +13,35 @@ from agents import evaluate
 from agents.loop import LagrangianSettings, LoopConfig, ShieldSettings
 from agents.training import require_trainable, train, untrained
 from ncs_gym import truck_trailer
-from shields.paper import PaperCertificate
 from tests.certificates import certificate_of
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 REPLAY = dict(n_envs=4, gradient_steps=1, batch_size=32, buffer_size=1000, learning_starts=64)
 CERTIFICATE = certificate_of(truck_trailer(mass=4000.0))
-PAPER = PaperCertificate(
-    L=np.eye(2),
-    K=np.zeros((1, 2)),
-    kappa=0.5,
-    rho=1.0,
-    epsilon=0.1,
-    epsilon_up=0.1,
-    fingerprint=CERTIFICATE.fingerprint,
-)
 NAN, INF = float("nan"), float("inf")
 OBSERVED = r"was trained in .* with observations of 3 entries.*shape \(3,\) or \(N, 3\), got "
 
 # What an algorithm of stable-baselines3 is asked to take, and what is said of it.
 HYPERPARAMS = [
     ("PPO", {"gama": 0.9}, "PPO: unknown hyperparameter 'gama'"),
-    ("SAC", {"gae_lambda": 0.9}, "SAC: unknown hyperparameter 'gae_lambda'"),
-    *(("PPO", {name: value}, f"unknown hyperparameter '{name}'") for name, value in
-      {"noise_std": 0.1, "device": "cuda"}.items()),
-    *(("PPO", {"n_epochs": value}, f"n_epochs must be a whole number >= 1, got {value}") for value in (1.5, 0)),
+    ("PPO", {"device": "cuda"}, "unknown hyperparameter 'device'"),
+    ("PPO", {"n_epochs": 1.5}, "n_epochs must be a whole number >= 1, got 1.5"),
     ("PPO", {"learning_rate": -1.0}, "PPO: Invalid learning rate: -1.0"),
     ("PPO", {"learning_rate": "lin_fast"}, "PPO: could not convert"),
     ("PPO", {"policy_kwargs": {"net_arch": ["64"]}}, "^PPO: "),
     ("SAC", {"replay_buffer_class": "HerReplayBuffer"}, "SAC: .*must be a class"),
     ("PPO", {"policy_kwargs": {"net_arc": [8]}}, "PPO: .*'net_arc'"),
     ("PPO", {"batch_size": 1}, "PPO: .*batch_size"),
-    *(("PPO", {"normalize": value}, "PPO: normalize must be true or") for value in (False, {"norm_obs": False})),
+    ("PPO", {"normalize": {"norm_obs": False}}, "PPO: normalize must be true or"),
     ("PPO", {"normalize": {"gain": 2.0}}, "PPO: normalize: unknown hyperparameter 'gain'"),
     *(("PPO", {"n_envs": value}, "n_envs must be a whole number >= 1") for value in (0, True)),
     ("PPO", {"gamma": 1.5}, r"gamma must be in \[0, 1\], got 1.5"),
     ("TD3", {"gamma": "high"}, r"gamma must be in \[0, 1\], got 'high'"),
     ("TD3", {"noise_std": -0.1}, "TD3: noise_std must be a number >= 0"),
     ("PPO", {"policy_kwargs": {"activation_fn": print}}, "hyperparameters must be JSON values, got {'policy_kwargs': "),
+    *(("PPO", {"policy_kwargs": {"activation_fn": value}}, "no activation function") for value in ("os.system", 3)),
     ("PPO", {"learning_rate": np.nan}, "hyperparameters must be JSON values, got {'learning_rate': nan"),
     ("DQN", {}, "unknown algorithm 'DQN'; known are PPO"),
-    (["PPO"], {}, r"unknown algorithm \['PPO'\]; known are"),
 ]  # fmt: skip
 
 CALLS = [
@@ -63,8 +51,7 @@ CALLS = [
     (partial(train, CRUISE, -5, 0), "steps must be at least 1, got -5"),
     (partial(require_trainable, CRUISE, 2_000, "SAC", {}), "a training of 2,000 steps trains nothing"),
     (partial(evaluate, CRUISE, None, 0, 0), "episodes must be at least 1, got 0"),
-    *((partial(ShieldSettings, value), f"certificate must be a Certificate, got {type(value).__name__}") for value in
-      (PAPER, None, CERTIFICATE.document)),
+    (partial(ShieldSettings, CERTIFICATE.document), "certificate must be a Certificate, got dict"),
     (partial(LoopConfig, env=f"ncs_gym:{CRUISE.env}"), "import the module that registers it, and give the id alone"),
     *((partial(LoopConfig, env=CRUISE.env, violation_penalty=value), "violation_penalty must be a number >= 0")
       for value in (-50.0, NAN, "5")),
@@ -80,7 +67,7 @@ CALLS = [
     *((partial(LagrangianSettings, **{name: value}), f"{name} must be >= 0")
       for name in ("cost_limit", "learning_rate", "multiplier") for value in (-0.1, NAN, INF)),
 ]  # fmt: skip
-SHAPES = [(4, 5), (5,), (2, 4, 3), (3, 1), ()]
+SHAPES = [(4, 5), (2, 4, 3), ()]
 
 
 @pytest.mark.parametrize(("algorithm", "change", "words"), HYPERPARAMS)

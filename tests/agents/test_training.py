@@ -8,13 +8,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import SafetyCallback, SB3VecEnv
 from agents.loop import LoopConfig, ShieldSettings
 from agents.training import require_trainable, train, untrained
 from tests.certificates import certificate_of
-from tests.product import safety_shield
 
 CRUISE = LoopConfig(env="ncs_gym/TruckTrailerCruise-v0")
 TINY = dict(n_envs=4, n_steps=64, batch_size=128, n_epochs=1)
@@ -97,10 +95,9 @@ def test_every_algorithm_trains_counts_and_repeats_itself(algorithm, settings, a
 
 def test_rate_falls_from_its_full_value_to_that_of_the_last_rollout_unless_it_is_constant():
     constant, falling = (
-        train(CRUISE, 4 * 256, 0, hyperparams=TINY | rate).agent for rate in ({"learning_rate": 0.003}, {})
+        train(CRUISE, 2 * 256, 0, hyperparams=TINY | rate).agent for rate in ({"learning_rate": 0.003}, {})
     )
-    expected = [0.003 * fraction for fraction in (1.0, 0.75, 0.5, 0.25)]
-    assert [falling.model.lr_schedule(remaining) for remaining in (0.75, 0.5, 0.25, 0.0)] == pytest.approx(expected)
+    assert [falling.model.lr_schedule(remaining) for remaining in (0.5, 0.0)] == pytest.approx([0.003, 0.0015])
     assert constant.model.lr_schedule(0.5) == pytest.approx(0.003)
     assert constant.checksum != falling.checksum
 
@@ -147,18 +144,17 @@ class Steps(BaseCallback):
         return True
 
 
-def logged_alike(model, steps, log_interval, **more):
+def logged_alike(model, steps, log_interval, callback=None):
     """Learns, and compares every log with the steps since the last one; returns the callback."""
-    dumps, seen, callback = Dumps(), Steps(), more.pop("callback", None) or SafetyCallback()
-    before = 0 if more.get("reset_num_timesteps", True) else model.num_timesteps
+    dumps, seen, callback = Dumps(), Steps(), callback or SafetyCallback()
     model.set_logger(Logger(None, [dumps]))
-    model.learn(steps, callback=[seen, callback], log_interval=log_interval, **more)
+    model.learn(steps, callback=[seen, callback], log_interval=log_interval)
     rows, start = np.array(seen.rows), 0
     names = "violation_rate", "intervention_rate", "mean_correction", "guaranteed_rate"
     logs = [(step, values) for step, values in dumps.found if "safety/violation_rate" in values]
     assert len(logs) > 1
     for step, values in logs:
-        stop = (step - before) // rows.shape[1]
+        stop = step // rows.shape[1]
         found = [values[f"safety/{name}"] for name in names]
         np.testing.assert_allclose(found, rows[start:stop].mean(axis=(0, 1)), rtol=1e-9)
         start = stop
@@ -178,12 +174,7 @@ def test_logs_are_about_all_steps_since_the_last_one(kind):
     model = PPO("MlpPolicy", env, **tiny)
     callback = logged_alike(model, 64 * 6, 2)
     assert callback.violation_steps > 0
-    first = callback.violation_steps, callback.history[-1].steps
-    # Another callback where the model goes on, and the same one where it counts its steps anew.
-    goes_on = logged_alike(model, 64 * 4, 2, reset_num_timesteps=False)
-    assert [point.steps for point in goes_on.history][:2] == [first[1] + 64, first[1] + 128]
-    again = logged_alike(PPO("MlpPolicy", env, **tiny), 64 * 4, 1, callback=callback)
-    assert again.history[-1].steps == 64 * 4
+    again = logged_alike(PPO("MlpPolicy", env, **tiny), 64 * 4, 1, callback)  # which counts its steps anew
     assert again.violation_steps == again.history[-1].violation_steps < 64 * 4
 
 
@@ -191,14 +182,3 @@ def test_what_the_library_takes_is_not_refused():
     linear = {"clip_range": "lin_0.2", "target_kl": None, "normalize": {"norm_reward": False, "clip_obs": 5}}
     require_trainable(CRUISE, 100_000, "PPO", linear | {"gamma": 1, "use_sde": True})
     require_trainable(CRUISE, 100_000, "SAC", {"ent_coef": 0.1, "noise_std": 0.1})
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("order", [1, -1], ids=["bare first", "shielded first"])
-def test_overrides_are_counted_where_only_some_environments_have_a_shield(order, certificate):
-    makes = [lambda: gym.make(CRUISE.env), lambda: safety_shield(gym.make(CRUISE.env), certificate)]
-    counted, steps = SafetyCallback(), Steps()
-    model = PPO("MlpPolicy", DummyVecEnv(makes[::order]), n_steps=64, batch_size=64, n_epochs=1, seed=0)
-    model.learn(256, callback=[counted, steps])
-    assert [counted.violation_steps, counted.interventions] == np.sum(steps.rows, axis=(0, 1))[:2].tolist()
-    assert counted.interventions > 10

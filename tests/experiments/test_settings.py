@@ -74,28 +74,9 @@ def test_results_of_every_engine_have_the_same_key_and_provenance():
     assert not names & lasting_settings(CompareSettings()).keys()
 
 
-def channel_of(*arguments):
-    return parse(["compare", *arguments]).channel
-
-
 @pytest.mark.parametrize(
     ("text", "value"),
-    [
-        ("0.5", 0.5),
-        ("null", None),
-        ('{"pi": [64]}', {"pi": [64]}),
-        ("lin_0.1", "lin_0.1"),
-        ("nn.ReLU", "nn.ReLU"),
-    ],
+    [("0.5", 0.5), ("null", None), ('{"pi": [64]}', {"pi": [64]}), ("lin_0.1", "lin_0.1")],
 )
 def test_value_is_a_json_value_or_a_word(text, value):
-    given = channel_of("--channel", f"loss={text}")
-    assert given == {"loss": value}
-    assert type(given["loss"]) is type(value)
-
-
-@pytest.mark.parametrize("text", ["dict(a=1)", "[64", "", "a b"])
-def test_what_is_neither_names_the_form(text, capsys):
-    with pytest.raises(SystemExit):
-        channel_of("--channel", f"loss={text}")
-    assert "expected loss=VALUE with a word or a JSON value" in " ".join(capsys.readouterr().err.split())
+    assert parse(["compare", "--channel", f"loss={text}"]).channel == {"loss": value}

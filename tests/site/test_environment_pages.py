@@ -3,9 +3,8 @@
 import gymnasium as gym
 import pytest
 
-from ncs_gym import Channel, register_plant
 from ncs_gym.registration import registered_ids
-from tests.product import linear_plant, safety_shield
+from tests.product import safety_shield
 from tests.site.hooks import site_hook
 
 SECTIONS = ["Description", "Action space", "Observation space", "Rewards", "Starting state", "Episode end", "Info"]
@@ -43,18 +42,3 @@ def test_every_environment_has_a_page_with_its_own_figures(pages, env_id):
     assert "hold in exact arithmetic" in section(page, "Certificate")
     ends = "ends the episode" if inner.terminate_on_violation else "does not end the episode"
     assert ends in section(page, "Episode end")
-
-
-def test_plant_that_is_registered_gets_a_page(pages):
-    bounds = dict.fromkeys(("disturbance_bound", "sensor_bound", "initial_bound"), 0.01)
-    plant = linear_plant(A=[[0.9]], B=[[0.1]], box=[1.0], u_max=2.0, dt=1.0, **bounds)
-    register_plant("Pages/Tank-v0", plant, channel=Channel(loss=0.25, delay=3), max_episode_steps=77)
-    try:
-        page = pages.environment_page("Pages/Tank-v0")
-    finally:
-        del gym.registry["Pages/Tank-v0"]
-    assert page.startswith("# Tank\n")
-    assert "](picture.png)" not in page
-    assert "lost with probability 0.25. What is not lost arrives 3 steps late." in section(page, "Channel and contract")
-    assert "truncated after 77 steps" in section(page, "Episode end")
-    assert "| 0 | u1 | 2 |" in section(page, "Action space")

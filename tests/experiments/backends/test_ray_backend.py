@@ -1,14 +1,10 @@
 """A real Ray on this machine: what it does when processes die, and what a user sees."""
 
-import os
 import signal
-import socket
 import subprocess
 import sys
 import time
 import zipfile
-from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +14,7 @@ from experiments.backends.execution import RunError, results_of  # noqa: E402
 from experiments.backends.ray_tasks import RETRIES, _on_node  # noqa: E402
 from experiments.runs.provenance import versions  # noqa: E402
 from experiments.settings import BackendSettings  # noqa: E402
-from tests.command import environment, is_alive, ncs_process  # noqa: E402
+from tests.command import environment, ncs_process  # noqa: E402
 from tests.experiments.backends.small_runs import Small  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -29,12 +25,8 @@ RUNS = 8
 TIMEOUT = 300.0
 
 
-def command(*arguments):
-    return [sys.executable, "-m", "experiments", *map(str, arguments)]
-
-
-def ncs(*arguments, cwd=None, **change):
-    run = ncs_process(*arguments, cwd=cwd, **change)
+def ncs(*arguments):
+    run = ncs_process(*arguments)
     assert "Traceback" not in run.stderr
     return run
 
@@ -43,11 +35,11 @@ def _take_interrupts():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def started(*arguments, **change):
+def started(*arguments):
     """A process in a group of its own, as a terminal starts it; SIGINT may be ignored where tests run."""
     return subprocess.Popen(
-        command(*arguments),
-        env=environment(**change),
+        [sys.executable, "-m", "experiments", *map(str, arguments)],
+        env=environment(),
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
@@ -55,43 +47,12 @@ def started(*arguments, **change):
     )
 
 
-def descendants(pid):
-    """Process ids and titles of all processes below one, from /proc."""
-    parents, titles = {}, {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(folder.name)] = int((folder / "stat").read_text().rsplit(")", 1)[1].split()[1])
-            titles[int(folder.name)] = (folder / "cmdline").read_text().replace("\0", " ").strip()
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-    found = {pid}
-    while more := {child for child, parent in parents.items() if parent in found} - found:
-        found |= more
-    return {each: titles[each] for each in found - {pid}}
-
-
-def working(pid):
-    return [each for each, title in descendants(pid).items() if title == "ray::_on_node"]
-
-
-def until(condition, what):
+def until_one_is_stored(out, run):
     deadline = time.monotonic() + TIMEOUT
-    while not (found := condition()):
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
-    return found
-
-
-def stored(out):
-    return len(list((out / "runs").glob("*.json")))
-
-
-def until_stored(out, count, run):
-    def enough():
+    while not list((out / "runs").glob("*.json")):
         assert run.poll() is None, "it ended too early"
-        return stored(out) >= count
-
-    until(enough, "nothing was stored")
+        assert time.monotonic() < deadline, "nothing was stored"
+        time.sleep(0.05)
 
 
 def lines_of_runs(text):
@@ -144,46 +105,13 @@ def test_node_with_another_source_is_refused_in_one_sentence():
         _on_node(versions() | {"source": "other"}, None)
 
 
-@contextmanager
-def running_head(tmp_path_factory):
-    """Address, environment and process of a cluster as in docs/vector.md, with a home and a token of its own."""
-    own = {"HOME": str(tmp_path_factory.mktemp("home")), "RAY_AUTH_MODE": "token"}
-    own |= {"RAY_TMPDIR": str(tmp_path_factory.mktemp("r")), "RAY_USAGE_STATS_ENABLED": "0"}
-    tool = [sys.executable, "-m", "ray.scripts.scripts"]
-    subprocess.run([*tool, "get-auth-token", "--generate"], env=environment(**own), check=True, capture_output=True)
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    options = ["--head", "--block", f"--port={port}", "--num-cpus=2", "--include-dashboard=false"]
-    process = subprocess.Popen(
-        [*tool, "start", *options], env=environment(**own), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    until(lambda: any("raylet" in title for title in descendants(process.pid).values()), "no Ray")
-    processes = descendants(process.pid)
-    yield f"127.0.0.1:{port}", own, process
-    process.terminate()
-    process.wait(timeout=60)
-    for pid in processes:
-        if is_alive(pid):
-            os.kill(pid, signal.SIGKILL)
-
-
-@pytest.fixture(scope="module")
-def head(tmp_path_factory):
-    with running_head(tmp_path_factory) as found:
-        yield found
-
-
-def test_running_cluster_is_used_and_outlives_the_driver(head, local, tmp_path):
-    address, own, process = head
-    out = tmp_path / "out"
-    run = started("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", out, **own)
-    until_stored(out, 1, run)
-    assert until(lambda: working(process.pid), "nobody works there")
+def test_interrupted_sweep_goes_on_to_the_same_rows(local, tmp_path):
+    given = ("sweep", *GRID, "--engine", "ray", "--out", tmp_path / "out")
+    run = started(*given)
+    until_one_is_stored(tmp_path / "out", run)
     run.send_signal(signal.SIGINT)
     _, errors = run.communicate(timeout=60)
     assert (run.returncode, errors.strip().splitlines()[-1]) == (130, "ncs: interrupted")
-    until(lambda: not working(process.pid), "its runs are not cancelled")
-    again = ncs("sweep", *GRID, "--engine", "ray", "--ray-address", address, "--out", out, **own)
+    again = ncs(*given)
     assert again.returncode == 0, again.stderr
-    assert process.poll() is None
-    assert_same(out, local)
+    assert_same(tmp_path / "out", local)

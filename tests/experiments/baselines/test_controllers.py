@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from experiments.baselines.controllers import CONTROLLERS, RegulatorWeights, controller, equilibrium
-from ncs_gym import Channel, Regulation, SetpointTracking, Task
+from ncs_gym import Channel, Regulation, SetpointTracking
 from ncs_gym.envs.env import ncs_env
 from shields.certificate import Fallback
 from tests.plants import small
@@ -36,13 +36,6 @@ class Own(SetpointTracking):
         return -task_state
 
 
-class Other(Task):
-    """Pays for going far, which nobody but its reward knows."""
-
-    def reward(self, plant, task_state, state, u):
-        return float(abs(state[0]))
-
-
 class Refined(Regulation):
     """Pays for something else than what it is derived from."""
 
@@ -52,16 +45,14 @@ class Refined(Regulation):
 
 def test_controllers_say_that_they_do_not_know_what_a_task_of_your_own_asks_for():
     plant, target = env_of("ncs_gym/CartPole-v0").plant, Own(output=np.eye(4)[0], reach=0.1, width=0.1)
-    own, other, refined = (loop_env(plant=plant, task=task) for task in (target, Other(), Refined()))
+    own, refined = (loop_env(plant=plant, task=task) for task in (target, Refined()))
     rests = Fallback.of_gain(np.zeros((1, 4)))
     for name in ("lqr", "mpc", "mpc:10"):
         controller(name, own, rests, 0)
-        with pytest.raises(ValueError, match=f"{name} does not know what a Other asks for"):
-            controller(name, other, rests, 0)
         with pytest.raises(ValueError, match=f"{name} does not know what a Refined asks for"):
             controller(name, refined, rests, 0)
     for name in ("zero input", "K x_hat", "random"):
-        controller(name, other, rests, 0)
+        controller(name, refined, rests, 0)
 
 
 @pytest.mark.parametrize("costs", [{}, {"state_cost": [[1.0, 0.0], [0.0, 0.0]], "input_cost": [[1e-4]]}])
@@ -97,28 +88,6 @@ def test_regulator_of_the_speed_removes_the_error():
         u = env.plant.u_max * regulator(np.append(x, left)[None], {"estimate": x[None]})[0]
         x, left = env.plant.A @ x + env.plant.B @ u, left - env.plant.dt * u[0]
     assert abs(left) < 0.05
-
-
-def nominal(env, name, weights):
-    """Largest |c_j x| on the way from rest to the outermost target, without disturbance."""
-    policy, plant = controller(name, env, Fallback.of_gain(np.zeros((1, 2))), 0, weights), env.plant
-    x, u, reached = np.zeros(plant.n), np.zeros(plant.m), 0.0
-    targets = np.full(1 + env.task.preview, env.task.reach)
-    for _ in range(150):
-        observed = np.concatenate([x, targets, u if env.task.change_price else []])
-        u = plant.u_max * policy(observed[None], {"estimate": x[None]})[0]
-        x = plant.A @ x + plant.B @ u
-        reached = max(reached, float(np.abs(plant.box_rows @ x).max()))
-    return reached
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("env_id", ["ncs_gym/LaneKeeping-v0", "ncs_gym/CSTR-v0", "ncs_gym/Convoy-v0"])
-def test_mpc_keeps_limits_and_margins_that_the_regulator_leaves(env_id):
-    env, weights = env_of(env_id), RegulatorWeights(1e-3, 0.0)
-    free, kept, with_margin = (nominal(env, name, weights) for name in ("lqr", "mpc", "mpc:20"))
-    assert kept <= 1.0 + 1e-6
-    assert with_margin <= min(0.8 + 1e-6, free)
 
 
 @pytest.mark.parametrize("env_id", ["ncs_gym/CSTR-v0", "ncs_gym/TruckTrailerCruise-v0", "ncs_gym/TruckTrailer-v0"])

@@ -11,7 +11,6 @@ from agents.loop import LoopConfig, ShieldSettings
 from experiments.baselines.controllers import controller
 from experiments.baselines.filters import FILTERS, CertaintyEquivalentFilter, EstimateFilterSettings, PredictiveFilter
 from ncs_gym.envs.env import ncs_env
-from shields.polytope import Polytope
 from tests.certificates import certificate_of, metric
 from tests.plants import delayed
 from tests.product import safety_filter, synthesize
@@ -124,7 +123,7 @@ def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(kind, cer
     plant = loaded
     if kind == "polytope":
         certificate = synthesize(loaded, contract=certificate.contract)
-        assert isinstance(certificate.safe_set, Polytope)
+        assert hasattr(certificate.safe_set, "rows")
     elif kind == "two ends":
         plant, certificate = PLANTS["angle"], limited("angle")
     predictive, grid = PredictiveFilter(certificate, plant, horizon=2), np.linspace(*plant.input_ends[:, 0], 401)
@@ -193,7 +192,7 @@ def test_predictive_filter_applies_the_rest_of_its_plan_and_then_the_gain(certif
 
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep"])
-def test_what_is_not_changed_is_passed_on_bit_for_bit_and_a_reset_counts_nothing(autoreset, certificate):
+def test_what_is_not_changed_is_passed_on_bit_for_bit(autoreset, certificate):
     def steps(wrap):
         envs = wrap(gym.make_vec(CRUISE, num_envs=3, max_episode_steps=5, autoreset_mode=autoreset))
         envs.reset(seed=4)
@@ -207,19 +206,18 @@ def test_what_is_not_changed_is_passed_on_bit_for_bit_and_a_reset_counts_nothing
         np.testing.assert_array_equal(behind[4]["shield_correction"], 0.0)
         assert not behind[4]["shield_intervened"].any()
 
-    envs = EstimateFilterSettings("trusting", certificate, 2.0)(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
-    free = EstimateFilterSettings("trusting", certificate)(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
-    for each in (envs, free):
-        each.reset(seed=1, options={"state": 0.95 * np.linalg.cholesky(certificate.safe_set.shape_matrix)[:, 0]})
-    overridden = 0
-    for k in range(4):
-        actions = np.full((2, 1), 1.0 if k < 3 else -1.0)
-        (_, paid, *_, info), (_, own, *_) = envs.step(actions), free.step(actions)
-        np.testing.assert_allclose(own - paid, 2.0 * info["shield_intervened"])
-        overridden += info["shield_intervened"].sum()
-        if k == 3:
-            assert not info["shield_intervened"].any()
-    assert overridden > 0
+
+def test_every_override_has_its_penalty_and_a_step_that_only_resets_none(certificate):
+    both = []
+    for penalty in (0.0, 2.0):
+        filtered = EstimateFilterSettings("trusting", certificate, penalty)
+        envs = filtered(gym.make_vec(CRUISE, num_envs=2, max_episode_steps=3))
+        envs.reset(seed=1, options={"state": 0.95 * np.linalg.cholesky(certificate.safe_set.shape_matrix)[:, 0]})
+        both.append([envs.step(np.full((2, 1), action)) for action in (1.0, 1.0, 1.0, -1.0)])
+    overridden = np.array([info["shield_intervened"] for *_, info in both[1]])
+    np.testing.assert_allclose([free[1] - paid[1] for free, paid in zip(*both, strict=True)], 2.0 * overridden)
+    assert overridden[:3].any()
+    assert not overridden[3].any()
 
 
 def test_only_an_environment_with_an_estimate_can_be_filtered(certificate):

@@ -66,14 +66,6 @@ def test_the_attack_does_harm_where_the_shield_only_watches():
     assert counts["guaranteed outside S"] == counts["guaranteed outside box"] == 0
 
 
-@pytest.mark.slow  # the campaign attacks plans in every day's tests
-def test_lookahead_may_leave_the_safe_set_and_keeps_the_box():
-    run = succeeded("attack", "--env", CART, "--mode", "lookahead", "--steps", 1)
-    _, _, outside_set, *others, _ = rows_of(run)["all"]
-    assert int(outside_set.replace(",", "")) > 100
-    assert others == ["0", "0"]
-
-
 @pytest.mark.parametrize(
     ("said", "words"),
     [

@@ -78,10 +78,7 @@ def test_what_one_sample_does_not_tell_stays_the_plants_own(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (
-            "time,force\n0,1\n",
-            "it has 0 columns named 'position'; a record has the columns force, position, y2 of numbers",
-        ),
+        ("time,force\n0,1\n", "it has 0 columns named 'position'; a record has the columns force, position, y2"),
         ("force,force,position,y2\n0,1,2,3\n", "it has 2 columns named 'force'"),
         ("force,position,y2\n0,1,2\n0,,2\n0,1,1\n", "row 2 has no 'position'; give a part of the record without gaps"),
         ("force,position,y2\n0,1,one\n", "line 2: 'one' is no number; a record has the columns"),

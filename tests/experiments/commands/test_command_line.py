@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,8 @@ from agents.agent import Agent
 from experiments.runs.policies import certificate_file
 from ncs_gym import truck_trailer
 from shields import Certificate
-from tests.command import SMOKE, assert_one_sentence, ncs, ncs_process, succeeded, without_pictures
+from tests.command import assert_one_sentence, ncs, ncs_process, succeeded
 from tests.product import library_plant
-from tests.workers import no_worker_processes
 
 ARM_KEYS = {"train_steps", "train_violation_steps", "eval_episodes", "eval_violation_steps", "eval_violating_episodes"}
 ARM_KEYS |= {"eval_violation_rate_ci95", "eval_return_mean", "eval_return_ci95", "intervention_rate"}
@@ -27,7 +25,6 @@ RUNS = 2 * (len(TRAINED) + len(FIXED))
 def test_smoke_run_leaves_every_file_of_the_contract(smoke):
     out, run = smoke
     assert "% of the safe box's volume)" in run.prose
-    assert "A smoke run shows that everything runs" in run.prose
     assert "training and evaluation: 100%" in run.stderr
     left = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and "tensorboard" not in path.parts}
     expected = {"summary.json", "settings.json", "episodes.parquet", "training.parquet", "report.html"}
@@ -48,14 +45,14 @@ def test_summary_holds_the_keys_of_the_contract_and_adds_up(smoke):
     for name, arm in summary["arms"].items():
         assert set(arm) >= ARM_KEYS
         mine = [row for row in rows if row["arm"] == name]
-        assert arm["eval_episodes"] == len(mine) == 20
+        assert arm["eval_episodes"] == len(mine) == 10
         assert arm["eval_violation_steps"] == sum(row["violating_steps"] for row in mine)
         assert arm["eval_violating_episodes"] == sum(row["violating"] for row in mine)
         assert arm["eval_return_mean"] == pytest.approx(np.mean([row["return"] for row in mine]))
-        assert arm["train_steps"] == 2 * 4096
+        assert arm["train_steps"] == 2 * 2048
     shielded, unshielded = summary["arms"]["shielded"], summary["arms"]["unshielded"]
     assert shielded["train_violation_steps"] == shielded["eval_violation_steps"] == 0
-    assert shielded["guaranteed_episodes"] == 20
+    assert shielded["guaranteed_episodes"] == 10
     assert shielded["times_safe_set"] <= 1.0
     assert unshielded["train_violation_steps"] > 0
     assert summary["paired_differences"]["baseline"] == "unshielded"
@@ -80,31 +77,6 @@ def test_columns_are_those_of_the_page_and_tables_say_where_they_come_from(smoke
     assert f"came to {largest:.3f} times the safe set" in smoke[1].prose
 
 
-def keep_runs(source, out, arms):
-    """Leaves in a folder what a run that was killed once these arms were finished would have left there."""
-    (out / "runs").mkdir(parents=True)
-    for arm in arms:
-        for path in [*(source / "runs").glob(f"{arm}-*.json"), *(source / "models").glob(f"{arm}-*/*")]:
-            (copy := out / path.relative_to(source)).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(path, copy)
-    if arms:
-        shutil.copy(source / "settings.json", out)
-
-
-def test_interrupted_run_goes_on_and_a_damaged_result_is_done_again(smoke, tmp_path):
-    out = tmp_path / "out"
-    keep_runs(smoke[0], out, (*TRAINED, *FIXED[1:]))
-    damaged = out / "runs" / f"{FIXED[1]}-1.json"
-    before = damaged.read_bytes()
-    damaged.write_bytes(before[:100])
-    with no_worker_processes(), without_pictures():
-        again = succeeded(*SMOKE, "--out", out)
-    assert f"{FIXED[1]}-1.json is damaged: its run is done again" in again.stderr
-    assert f"{RUNS - 3} of {RUNS} runs were finished before" in again.stderr
-    assert damaged.read_bytes() == before
-    assert (out / "summary.json").read_bytes() == (smoke[0] / "summary.json").read_bytes()
-
-
 def digests(folder):
     """Contents of all files but those of TensorBoard."""
     files = (path for path in folder.rglob("*") if path.is_file() and "tensorboard" not in path.parts)
@@ -126,7 +98,6 @@ def test_saved_agent_is_evaluated(smoke, tmp_path):
     arm = left["arms"]["shield: project"]
     assert (arm["eval_episodes"], arm["eval_violation_steps"], arm["guaranteed_episodes"]) == (5, 0, 5)
     assert (left["channel"]["loss"], left["channel"]["delay"]) == (0.9, 2)
-    assert ", 5 episodes" in run.stdout
     assert " 0.0 [0.0, 52.2] " in run.stdout
 
 
@@ -183,33 +154,19 @@ def test_synthesize_then_verify(tmp_path):
     file = tmp_path / "c.json"
     made = succeeded("synthesize", "--env", "ncs_gym/TruckTrailer-v0", "--out", file)
     checked = succeeded("verify", file, "--out", tmp_path / "report.json")
-    for printed, last in ((made.stdout, f"saved to {file}"), (checked.stdout, f"{file} verifies")):
-        lines = printed.splitlines()
-        (verdict,) = [number for number, line in enumerate(lines) if "valid" in line]
-        assert (lines[verdict][:7], lines[verdict + 1][:6], lines[-1]) == ("valid: ", "holds ", last)
+    assert made.stdout.endswith(f"saved to {file}\n")
+    assert checked.stdout.endswith(f"{file} verifies\n")
     assert json.loads((tmp_path / "report.json").read_text())["valid"] is True
     other = ncs("verify", file, "--env", "ncs_gym/TruckTrailerCruise-v0")
-    assert_one_sentence(other, "does not verify: it was made for another plant", "without --env and --plant")
-    assert "Beyond the contract" not in made.stdout + checked.stdout  # it has none
-    held = " ".join(checked.stdout.partition("What can be held:")[2].split())
-    assert held.startswith("reach 100 % of |coupling stretch| <= 2 m, ")
-    assert "set points coupling stretch from -0.8" in held
-    exceeded = ncs("verify", Path(shields.__file__).parent / "packaged_certificates" / "Pendulum-v0.json").stdout
-    assert "until the newest is 3 steps (150 ms) old" in " ".join(exceeded.partition("Beyond")[2].split())
-    assert "with samples 0 steps old, from -0.2243 to 0.2243 rad with samples 2 steps old" in " ".join(exceeded.split())
+    assert_one_sentence(other, "does not verify: it was made for another plant")
+    assert "set points coupling stretch from -0.8" in checked.prose.partition("What can be held:")[2]
+    exceeded = ncs("verify", Path(shields.__file__).parent / "packaged_certificates" / "Pendulum-v0.json").prose
+    assert "until the newest is 3 steps (150 ms) old" in exceeded.partition("Beyond")[2]
 
 
 def test_command_does_the_same_in_this_process_and_in_one_of_its_own(tmp_path):
     own = ncs_process("fly", cwd=tmp_path)
     assert ncs("fly", cwd=tmp_path) == (own.returncode, own.stdout, own.stderr)
-
-
-def test_help_of_a_comparison_shows_its_settings_on_two_screens():
-    run = ncs("compare", "--help", COLUMNS="80")
-    assert run.returncode == 0
-    for flag in ("--env", "--channel", "--hyperparams", "--ray-address"):
-        assert flag in run.stdout
-    assert len(run.stdout.splitlines()) <= 96
 
 
 def test_infeasible_problem_is_one_sentence(tmp_path):
@@ -224,7 +181,7 @@ def test_damaged_and_foreign_certificates_are_one_sentence(certificate, tmp_path
     certificate.save(tmp_path / "c.json")
     text = (tmp_path / "c.json").read_text()
     (tmp_path / "cut.json").write_text(text[: len(text) // 2])
-    (tmp_path / "changed.json").write_text(text.replace('"rounding": 0.', '"rounding": 0.1', 1))
+    (tmp_path / "changed.json").write_text(text.replace('"fingerprint": "', '"fingerprint": "0', 1))
     assert_one_sentence(ncs("verify", tmp_path / "cut.json"), "not valid JSON")
     assert_one_sentence(ncs("verify", tmp_path / "changed.json"), "altered")
     foreign = ["compare", "--env", "ncs_gym/TruckTrailer-v0", "--certificate", tmp_path / "c.json"]

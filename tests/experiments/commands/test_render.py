@@ -1,9 +1,6 @@
 """The command that draws an episode, and the policies it plays."""
 
-from dataclasses import replace
-
 import gymnasium as gym
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -11,7 +8,6 @@ from agents.loop import LoopConfig
 from agents.training import untrained
 from experiments.commands.render import RenderSettings, render
 from experiments.runs.policies import policy_by_name
-from ncs_gym import Channel
 from ncs_gym.rendering import theme
 from tests.command import succeeded
 
@@ -58,33 +54,6 @@ def test_episode_that_ends_early_ends_the_animation(tmp_path, capsys):
     with Image.open(tmp_path / "a.gif") as image:
         assert 2 < image.n_frames < 100
     assert "1 with a violation" in capsys.readouterr().out
-
-
-def test_pictures_are_twice_as_dense_as_animations(tmp_path, certificate_file):
-    sizes = {}
-    for name in ("a.png", "b.gif"):
-        render(settings(out=tmp_path / name, certificate=certificate_file))
-        with Image.open(tmp_path / name) as image:
-            sizes[name] = image.size
-    assert sizes == {"a.png": (1280, 960), "b.gif": (640, 480)}
-
-
-def test_random_policy_follows_the_seed():
-    env, info = gym.make(CRUISE).unwrapped, {"estimate": np.zeros(2)}
-    first, again, other = (policy_by_name("random", CRUISE, env, seed)(np.zeros(3), info) for seed in (1, 1, 2))
-    assert first == again
-    assert first != other
-    assert policy_by_name("zero-input", CRUISE, env, 0)(np.zeros(3), info) == [0.0]
-
-
-def test_settings_that_an_agent_was_trained_with_are_named(model, tmp_path, capsys):
-    env, (_, agent) = gym.make(CRUISE).unwrapped, model
-    policy_by_name(str(model[0]), CRUISE, env, 0)
-    assert capsys.readouterr().err == ""
-    replace(agent, channel=Channel(loss=0.5), kwargs={"horizon": 5}).save(tmp_path)
-    policy_by_name(str(tmp_path), CRUISE, env, 0)
-    expected = f"{tmp_path} was trained with its own horizon, channel: here it acts in {CRUISE} as registered\n"
-    assert capsys.readouterr().err == expected
 
 
 def test_model_of_another_environment_is_refused(model):

@@ -11,7 +11,6 @@ from experiments.paper.audit import (
     Verdict,
     box_is_invariant,
     demonstration,
-    disturbance_set,
     equivalence,
     farthest_without_input,
     least_contracting_gain,
@@ -121,12 +120,6 @@ def test_only_if_verdict_follows_the_example(change, is_invariant, breaks_condit
     assert (example.is_invariant, example.breaks_condition) == (is_invariant, breaks_condition)
     expected = Verdict.FAILS if is_invariant and breaks_condition else Verdict.UNDECIDED
     assert equivalence(CASE, example).verdict == expected
-
-
-def test_ball_and_box_are_compared_by_area():
-    claim = disturbance_set(CASE)
-    assert f"{100 * 0.04 * 0.02 / (np.pi * 5e-4):.0f} %" in claim.computed
-    assert "[-0.02, 0.02] x [-0.01, 0.01]" in claim.printed
 
 
 def test_whole_box_is_invariant_without_input_and_a_wider_plant_leaves_it():

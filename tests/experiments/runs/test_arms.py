@@ -77,6 +77,13 @@ def test_weight_of_a_penalty_may_be_part_of_the_name(run_of):
     assert {run.arm for run in weights.values()} == set(weights)
 
 
+def test_lookahead_alone_takes_the_horizon(run_of):
+    planning = run_of("lookahead", arms=("lookahead",), horizon=4)
+    assert (planning.loop.shield.mode, planning.loop.shield.horizon) == ("lookahead", 4)
+    assert run_of("shielded", arms=("lookahead",), horizon=4).loop.shield.horizon is None
+    assert planning.key != run_of("lookahead", arms=("lookahead",), horizon=5).key
+
+
 def test_filter_at_test_is_not_there_in_training(run_of):
     for name, kind in (("shield at test", VectorSafetyShield), ("trusting at test", EstimateFilter)):
         run = run_of(name)

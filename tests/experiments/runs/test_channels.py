@@ -6,11 +6,6 @@ from ncs_gym import Channel, GilbertElliott
 OWN = Channel(loss=0.3, quantization_step=0.05, send_period=2, delay=2)
 
 
-def test_nothing_asked_for_changes_nothing():
-    assert changed_channel(OWN, {}) is None
-    assert changed_channel(OWN, {"loss": 0.3, "delay": None}) is None
-
-
 def test_what_is_asked_for_replaces_the_environments_own():
     changed = changed_channel(OWN, {"loss": 0.1, "delay": 0, "max_consecutive_losses": 4})
     expected = Channel(loss=0.1, quantization_step=0.05, send_period=2, delay=0, max_consecutive_losses=4)

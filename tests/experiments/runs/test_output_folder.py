@@ -30,7 +30,6 @@ def finished(command, settings, file="summary.json"):
     [
         ("compare", CompareSettings, {"seed": 1}, r"\(seed 0, now 1\)"),
         ("compare", CompareSettings, {"channel": {"loss": 0.5}}, r"\(channel {}, now {'loss': 0.5}\)"),
-        ("compare", CompareSettings, {"seed": 1, "algorithms": ("SAC",), "steps": 1, "episodes": 1}, r"; \.\.\.\)"),
         ("train", TrainSettings, {"arm": "unshielded"}, "arm"),
         ("sweep", SweepSettings, {"episodes": 3}, "episodes"),
         ("paper", PaperSettings, {"starts": 3}, "starts"),
@@ -53,7 +52,6 @@ def test_folder_with_results_of_other_settings_is_refused(command, kind, change,
 @pytest.mark.parametrize(
     ("command", "kind", "change"),
     [
-        ("compare", CompareSettings, {}),
         ("compare", CompareSettings, {"jobs": 7, "smoke": True}),
         ("compare", CompareSettings, {"seeds": 4, "arms": (*CompareSettings.arms, "psf")}),
         ("sweep", SweepSettings, {"engine": "ray", "ray_address": "auto"}),

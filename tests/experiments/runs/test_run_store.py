@@ -35,8 +35,15 @@ def test_stored_result_comes_back_exactly(folder, run, result):
     assert {path.name: path.read_bytes() for path in models.iterdir()} == again.files == result.files
 
 
+def test_stored_result_is_not_made_again(folder, run, result, monkeypatch, capsys):
+    monkeypatch.setattr(type(run), "execute", None)
+    (again,) = results_of([run], folder, BackendSettings(jobs=1))
+    assert again.episodes == result.episodes
+    assert "1 of 1 runs were finished before" in capsys.readouterr().err
+
+
 def test_result_of_anything_else_is_not_taken(folder, run, certificate, monkeypatch):
-    changes = [{"seed": 1}, {"steps": 257}, {"settings": {}}]
+    changes = [{"seed": 1}, {"steps": 257}, {"settings": {}}, {"scenarios": ("gaussian",)}]
     changes.append({"certificate": replace(certificate, provenance=certificate.provenance | {"note": "other"})})
     loops = [{"violation_penalty": 0.5}, {"kwargs": {"noise": "gaussian"}}, {"lagrangian": LagrangianSettings()}]
     loops += [{"kwargs": {"channel": {"loss": {"p_good_to_bad": 0.1, "p_bad_to_good": 0.5}}}}, {"shield": None}]
