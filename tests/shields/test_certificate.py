@@ -1,14 +1,6 @@
-import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid
 from shields import Certificate, CertificateError
-
-
-def test_matrix_and_sets_are_derived_from_L(certificate):
-    np.testing.assert_allclose(certificate.M @ certificate.L, np.eye(2), atol=1e-12)
-    assert isinstance(certificate.safe_set, Ellipsoid)
-    np.testing.assert_array_equal(certificate.error_set.shape_matrix, certificate.Sigma)
 
 
 @pytest.mark.parametrize(

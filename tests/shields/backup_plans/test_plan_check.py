@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid
-from shields.runtime.backup_plans import PlanTest, Prediction, plan_check
-from shields.runtime.backup_plans.plan_check import Tightening
+from shields.runtime.backup_plans import PlanTest, Prediction
 from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.set_test import SMALLEST_RADIUS, ellipsoid_test
@@ -154,19 +153,6 @@ def test_plans_are_certified_if_every_possible_state_stays_in_the_box_and_ends_i
     assert refused > 5
     assert lengths > 10
     assert max(levels) > 0.9
-
-
-def test_plans_of_one_input_are_certified_by_the_one_step_test(case):
-    plant, certificate, test = case
-    shield, rng = safety_filter(certificate, plant), np.random.default_rng(4)
-    estimates, shapes, plans = situations(plant, certificate, rng, 200)
-    certified = test.certified(estimates, test.tightenings_of(shapes), plans)[:, 0, 0]
-    safe = [
-        shield.decide(x_hat, shape, plan[0, 0]).reason == "safe"
-        for x_hat, shape, plan in zip(estimates, shapes, plans, strict=True)
-    ]
-    assert (certified == safe).mean() > 0.99  # but for what more is taken off for rounding
-    assert certified.any()
 
 
 @pytest.mark.parametrize("where", ["estimate", "shape", "input"])
@@ -351,25 +337,3 @@ def test_end_is_certified_in_rational_arithmetic_where_disturbances_are_long_and
         x = edge_of(lambda x, t=test, k=known, p=plan: t.certified(np.array([[0.0, x]]), k, p)[0, 0, -1], 16.0)
         levels.append(exact_reach(plant, ROWS[1], np.array([0.0, x]), error, plan[0, 0]))
     assert 1.0 - 1e-4 < min(levels) <= max(levels) <= 1.0
-
-
-def test_tightenings_are_remembered_and_do_not_depend_on_the_batch(case, monkeypatch):
-    plant, certificate, test = case
-    worked_out, tightenings = [], plan_check.tightenings
-
-    def counted(prediction, shapes):
-        worked_out.append(len(shapes))
-        return tightenings(prediction, shapes)
-
-    monkeypatch.setattr(plan_check, "tightenings", counted)
-    _, shapes, _ = situations(plant, certificate, np.random.default_rng(5), 6)
-    fresh = PlanTest(test.prediction, MARGIN)
-    together = fresh.tightenings_of(np.concatenate([shapes, shapes[:2]]))
-    assert sum(worked_out) == 6
-    for e, shape in enumerate((*shapes, *shapes[:2])):
-        alone = PlanTest(test.prediction, MARGIN).tightenings_of(shape[None])
-        again = fresh.tightenings_of(shape[None])
-        for name in Tightening._fields:
-            np.testing.assert_allclose(getattr(together, name)[e], getattr(alone, name)[0], rtol=1e-12, atol=1e-12)
-            np.testing.assert_array_equal(getattr(again, name)[0], getattr(together, name)[e])
-    assert sum(worked_out) == 6 + 8  # those that stood alone

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import AdversarialDisturbance, Ellipsoid
-from shields import Certificate, verify
+from shields import verify
 from tests.product import safety_filter, vector_shield
 from tests.second_verifier.verify import verify_again
 from tests.shields.polytope.limits import CHANNEL, CONTRACT, PLANTS, certificate, mixed_values
@@ -28,15 +28,6 @@ def test_both_engines_prove_it_with_the_same_margins(name):
         assert condition.margin == pytest.approx(margins[condition.name], rel=1e-9, abs=1e-12)
     assert found.polytope is not None
     assert not found.keeps_ellipsoid
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_file_keeps_it(name, tmp_path):
-    certificate(name).save(tmp_path / "c.json")
-    again = Certificate.load(tmp_path / "c.json")
-    assert again == certificate(name)
-    assert verify(again, PLANTS[name]).valid
-    assert "Infinity" not in (tmp_path / "c.json").read_text()
 
 
 @pytest.mark.cases(3)

@@ -17,8 +17,7 @@ from ncs_gym.network.contract import ChannelContract, contract_of
 from ncs_gym.registration import CART_POLE_CHANNEL
 from shields.errors import Infeasible
 from shields.synthesis import invariant_polytope as search
-from shields.synthesis.polytope_certificates import certified_polytope, with_polytope
-from shields.synthesis.resting_point import at_operating_point
+from shields.synthesis.polytope_certificates import with_polytope
 from shields.verification.polytope_conditions import half_widths, root_above
 from tests.certificates import certificate_of
 from tests.plants import random_plant
@@ -91,47 +90,6 @@ def test_box_with_nearly_the_same_row_twice_has_its_polytope(again):
     assert found.polytope is not None
 
 
-def test_box_of_more_rows_than_a_polytope_has_says_so():
-    angles = np.arange(401) * np.pi / 401
-    rows = np.column_stack([np.cos(angles), np.sin(angles)])
-    with pytest.raises(Infeasible, match="the safe box alone has 401 rows, and it would need 400 at most"):
-        search.invariant_faces(faces(rows), halved, len(rows))
-    assert len(search.invariant_faces(faces(rows[:400:50]), halved, 8).rows) == 8
-
-
-def faces(rows):
-    return search.Faces(rows, -np.ones(len(rows)), np.ones(len(rows)))
-
-
-def halved(given):
-    return given._replace(rows=0.5 * given.rows)
-
-
-def slow_plant():
-    """Time constants of 60, 2 and .05 s at steps of .1 s; the limits have two different ends."""
-    return linear_plant(
-        A=[[0.9982, -0.0004, 0.0024], [0.0475, 0.9645, -0.2049], [0.2070, -0.1415, 0.1174]],
-        B=0.01 * np.ones((3, 1)),
-        state_limits=([-0.9, -0.8, -1.1], [1.1, 1.2, 0.9]),
-        u_max=1.0,
-        dt=0.1,
-        disturbance_bound=4.5e-4,
-        sensor_bound=1e-3,
-        initial_bound=1e-3,
-    )
-
-
-@pytest.mark.slow
-def test_polytope_of_too_many_rows_is_replaced_by_a_coarser_one_that_is_nearly_as_large(monkeypatch):
-    plant, lines = slow_plant(), []
-    monkeypatch.setattr(search, "MOST_ROWS", 12)
-    found = certified_polytope(plant, np.zeros((1, 3)), None, at_operating_point(plant), lines.append)
-    assert sum("more than 12 rows" in line for line in lines) == 1
-    assert len(found.polytope.rows) <= 12
-    assert verified(found, plant).valid
-    assert found.provenance["polytope_share_of_box"] == pytest.approx(0.956, abs=0.002)
-
-
 def test_state_that_no_limit_sees_is_limited_so_that_a_polytope_has_an_end():
     plant = linear_plant(
         A=[[0.9, 0.0], [0.0, 0.8]], B=[[0.1], [0.0]], dt=0.1, state_limits=([-1.0, -np.inf], [1.0, np.inf]), u_max=1.0,
@@ -162,18 +120,6 @@ def test_search_for_a_polytope_that_is_ended_leaves_the_ellipsoid():
     assert found.polytope is None
     assert found.provenance["interrupted_at"].startswith("polytope, when the time_limit")
     np.testing.assert_array_equal(found.L, synthesize(plant, safe_set="ellipsoid").L)
-
-
-def test_numbers_out_of_reach_leave_the_ellipsoid(monkeypatch):
-    certificate, plant = found("BatchReactor")[1:]
-
-    def failing(*_, **__):
-        raise ArithmeticError("a row of a linear program is too large")
-
-    monkeypatch.setattr(search, "Extremes", failing)
-    narrow = with_polytope(certificate, plant)
-    assert narrow.polytope is None
-    assert "out of reach of float64" in narrow.provenance["no_polytope"]
 
 
 @pytest.mark.cases(1)

@@ -135,13 +135,6 @@ def test_wild_stamps_and_inputs_do_not_stop_an_actuator(input_delay):
     assert len(pickle.dumps(actuator)) < 2 * size
 
 
-def test_command_that_comes_early_is_kept_for_its_step():
-    actuator = Actuator(1, 1)
-    actuator.receive([Command(0, np.array([[0.0], [1.0]])), Command(1, np.array([[1.0], [2.0]]))])
-    assert [actuator.apply(step).tolist() for step in range(4)] == [[0.0], [1.0], [2.0], [0.0]]
-    assert (actuator.missing, actuator.echo.missing) == (True, 1)
-
-
 def test_actuator_whose_clock_goes_back_says_that_it_applied_something_else():
     actuator = Actuator(0, 1)
     actuator.receive([Command(step, np.full((1, 1), 1.0 + step)) for step in range(2)])
