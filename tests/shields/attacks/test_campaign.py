@@ -79,7 +79,7 @@ def campaign() -> list:
     return rows
 
 
-@pytest.mark.cases(14)
+@pytest.mark.cases(10)
 @pytest.mark.parametrize(("name", "mode", "through", "is_whole"), campaign())
 def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
     first = [*CASES].index(name) + MODES.index(mode)
@@ -103,7 +103,7 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
         assert counts["guaranteed"] > 0.3 * counts["steps"]
 
 
-@pytest.mark.cases(5)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize(("count", "steps"), [(30, 50), pytest.param(200, 500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, count, steps):
@@ -137,7 +137,7 @@ def test_errors_that_came_back_into_certified_sets_stay_there_while_the_contract
     assert min(outcome.counts["lost"], outcome.counts["certified again"]) > 0
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     ("name", "seed"),
     [
@@ -265,7 +265,7 @@ def twins() -> list:
     ]
 
 
-@pytest.mark.cases(10)
+@pytest.mark.cases(9)
 @pytest.mark.parametrize(("defect", "name", "mode", "through"), twins())
 def test_the_adversary_catches(defect, name, mode, through, monkeypatch):
     claims, _, anyway, _ = TWINS[defect]

@@ -215,7 +215,7 @@ def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(wh
     test, rng = PlanTest(Prediction(ellipsoid_test(L, plant), steps), margin), np.random.default_rng(0)
     nothing, levels = np.zeros((1, 1)), []
     known = test.tightenings_of(nothing[None])
-    for _ in range(40):
+    for _ in range(20):
         plan, first, start = np.zeros((steps, 2)), rng.uniform(-0.9, 0.9), np.array([1e-3 * rng.uniform(-1.0, 1.0)])
 
         def passes(size, plan=plan, first=first, start=start):
@@ -237,7 +237,7 @@ def test_plans_are_certified_in_rational_arithmetic_where_powers_cancel(where, s
     test, rng = PlanTest(Prediction(ellipsoid_test(L, plant), steps), 0.0), np.random.default_rng(0)
     nothing, levels = np.zeros((2, 2)), []
     known = test.tightenings_of(nothing[None])
-    for _ in range(60):
+    for _ in range(30):
         plan, start = np.zeros((steps, 1)), rng.uniform(0.1, 0.5) * np.array([1.0, 3.0])
 
         def passes(size, plan=plan, start=start):
@@ -297,7 +297,7 @@ def test_box_is_certified_in_rational_arithmetic_where_the_error_is_long_and_thi
     plant = linear_plant(A=0.5 * np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=0.0, **QUIET)
     test, rng = PlanTest(Prediction(ellipsoid_test(1e4 * TILTED @ TILTED.T, plant), 2), 0.0), np.random.default_rng(0)
     nothing, plan, levels = np.zeros((1, 2)), np.zeros((1, 1, 2, 1)), []
-    for _ in range(12):
+    for _ in range(6):
         factor = TILTED @ rng.standard_normal((2, 2)) * [1.0, 0.1]
         shape = factor @ factor.T
         size = edge_of(lambda s, P=shape: test.certified(nothing, test.tightenings_of(s * P[None]), plan)[0, 0, 1], 1e3)
@@ -329,7 +329,7 @@ def test_end_is_certified_in_rational_arithmetic_where_disturbances_are_long_and
     # Disturbances that do not move on add up tightly, and so does an error as small as the smallest multiplier.
     rng, levels = np.random.default_rng(0), []
     error = np.diag([0.0, 1e-18])
-    for _ in range(40):
+    for _ in range(20):
         bound = TILTED @ np.diag([1e-3, 1e-2] * rng.uniform(0.5, 1.0, 2)) @ TILTED.T
         plant = linear_plant(A=np.eye(2), B=np.zeros((2, 1)), box=ROWS, disturbance_bound=Ellipsoid(bound), **QUIET)
         test = PlanTest(Prediction(ellipsoid_test(TILTED @ TILTED.T, plant), steps), 0.0)

@@ -191,7 +191,7 @@ class NoArray:
 
 
 NO_PLANS = (
-    *(None, "plan", np.nan, NoArray(), [[1.0], []], [[1.0], [1.0, 2.0]], [np.ones(1), np.ones(2)]),
+    *(None, "plan", NoArray(), [[1.0], [1.0, 2.0]]),
     *(np.zeros((2, 2)), np.full((1, 1), np.nan), np.full((1, 1), 1e9), np.ones((99, 1))),
 )
 
@@ -248,10 +248,9 @@ def broken_solver(how, rng):
                 fail()
             x = {
                 "NaN": np.full(self.size, np.nan),
-                "infinite": np.full(self.size, np.inf),
                 "too short": np.zeros(self.size - 1),
                 "garbage": rng.uniform(-1, 1, self.size),
-                "beyond the limits": rng.uniform(-9, 9, self.size),
+                "too large": rng.uniform(-9, 9, self.size),
                 "nothing": None,
             }.get(how)
             return SimpleNamespace(x=x, status="Solved")
@@ -259,17 +258,7 @@ def broken_solver(how, rng):
     return Solver
 
 
-FAILURES = [
-    "raises when made",
-    "raises when updated",
-    "raises",
-    "NaN",
-    "infinite",
-    "too short",
-    "garbage",
-    "beyond the limits",
-    "nothing",
-]
+FAILURES = "raises when made", "raises when updated", "raises", "NaN", "too short", "garbage", "too large", "nothing"
 
 
 def break_solver(monkeypatch, how, rng):

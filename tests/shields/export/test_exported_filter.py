@@ -23,7 +23,7 @@ from tests.shields.export.board import NAMES, TWO_ENDS, Boards, altered, compile
 
 EPISODE = 250
 # Compiled every day; the tests of the others are slow.
-DAILY = {("CartPole", True), ("CSTR", False), ("tanks", False), ("hill", False)}
+DAILY = {("CartPole", True), ("CSTR", False), ("hill", False)}
 EVERY = [*((name, False) for name in (*NAMES, *TWO_ENDS)), ("CartPole", True), ("CSTR", True), ("tanks", True)]
 FILTERS = [pytest.param(*each, marks=[] if each in DAILY else [pytest.mark.slow]) for each in EVERY]
 
@@ -74,7 +74,7 @@ def test_c_does_what_its_python_reading_does(exported, name, single):
     (folder, table), (plant, certificate) = exported(name, single), example(name)
     rng, h, seen = np.random.default_rng(1), certificate.contract.max_age, set()
     board = Boards(folder, 1, plant.n, plant.m)
-    for episode in range(24):
+    for episode in range(12):
         first = rng.uniform(-1.0, 1.0, plant.n) * plant.half_widths * [0.0, 0.2, 1.5, 200.0][episode % 4]
         reading, states = BoardFilter(table, episode, first), [first]
         assert board.start(episode, first[None])
@@ -205,7 +205,7 @@ def test_an_altered_table_never_starts(exported, tmp_path):
     count, n = len(table.joint), table.sizes["N"]
     last = lambda text: repr(float(np.nextafter(float(text), 1e9)))  # noqa: E731
     number = r"(?<=[ \n])-?\d+\.\d+(?=[,\n])"
-    changes = [(number, last, which) for which in (0, 40, -2 * count)]
+    changes = [(number, last, which) for which in (0, -2 * count)]
     changes += [(r"(?<=checksum = 0x)[0-9a-f]+", lambda text: f"{1 + (text[0] == '1')}{text[1:]}", 0)]
     for k, change in enumerate(changes):
         damaged = copied(folder, tmp_path / str(k))

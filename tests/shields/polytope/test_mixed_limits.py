@@ -101,12 +101,6 @@ def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it(name):
         assert decision.input == pytest.approx(0.3 * np.sign(proposed), abs=1e-3)
 
 
-def test_plant_with_such_limits_has_none_that_are_only_symmetric():
-    for name in ("u_max", "box_rows"):
-        with pytest.raises(ValueError, match="this needs limits"):
-            getattr(PLANTS["coupled"], name)
-
-
 def test_only_a_polytope_is_sought_and_a_limit_that_nothing_keeps_has_a_reason():
     with pytest.raises(ValueError, match="only a polytope is sought"):
         synthesize(PLANTS["coupled"], safe_set="ellipsoid")
