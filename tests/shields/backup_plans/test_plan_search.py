@@ -205,8 +205,9 @@ def test_what_is_no_plan_counts_as_none_stored():
         for one, other in zip(expected, decisions(shield, cases, stored), strict=True):
             assert one.reason == other.reason
             np.testing.assert_array_equal(one.input, other.input)
-    for one in decisions(shield, cases, np.zeros((2, 1))):  # a projected input leaves nothing of an earlier plan
-        assert one.stored or one.reason == "planned" or len(one.plan) == 0
+    for one, other in zip(expected, decisions(shield, cases, np.zeros((2, 1))), strict=True):
+        assert one.reason != "projected" or other.reason in ("projected", "planned")
+        assert other.reason != "projected" or len(other.plan) == 0  # nothing is left of the plan before
     for stored in (*NO_PLANS, [[4.1]], np.zeros((9, 1))):  # beyond the limits, and longer than plans are
         decision = far.decide(np.full(2, 30.0), 0.1 * far.certificate.Sigma, np.zeros(1), stored)
         assert decision.reason == "fallback"

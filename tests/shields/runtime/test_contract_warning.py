@@ -42,6 +42,12 @@ def test_channel_that_breaks_the_contract_without_any_loss_is_pointed_out(make, 
     assert [each.filename for each in caught] == [product.__file__]
 
 
+def test_rounding_that_the_contract_does_not_allow_is_pointed_out():
+    env = loop_env(PLANT, Channel(quantization_step=0.01, max_consecutive_losses=0))
+    with pytest.warns(BrokenContractWarning, match="the channel rounds measurements to 0.01, but .* allows 0, so"):
+        safety_shield(env, certificate_of(PLANT, CONTRACT))
+
+
 @pytest.mark.parametrize(
     ("make", "channel", "downlink"),
     [(loop, Channel(delay=4), None), (shield, Channel(loss=0.9, jitter=9), None), (loop, Channel(delay=1), DOWNLINK)],

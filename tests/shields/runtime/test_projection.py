@@ -153,14 +153,6 @@ def test_many_projections_at_once_are_those_one_by_one(m):
     assert min(outcomes.values()) > 15
 
 
-@pytest.mark.parametrize("m", [1, 2, 3])
-def test_nothing_is_found_without_a_radius(m):
-    still = np.zeros(m)
-    assert closest_admissible(still, still, np.eye(m), -1e-9, np.ones(m)) is None
-    np.testing.assert_array_equal(closest_admissible(still, still, np.eye(m), 0.0, np.ones(m)), still)
-    np.testing.assert_allclose(closest_admissible(still + 0.5, still, np.eye(m), 0.0, np.ones(m)), still, atol=1e-150)
-
-
 @pytest.mark.parametrize("m", [2, 3])
 def test_converges_where_one_input_does_far_more_than_the_others(m):
     # By another route: the multiplier by bisection, in the axes of a singular value decomposition.

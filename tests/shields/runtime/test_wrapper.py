@@ -6,7 +6,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from ncs_gym import AdversarialDisturbance
 from shields import SafetyShield
 from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
@@ -104,11 +103,3 @@ def test_monitor_is_the_unshielded_environment_bit_for_bit(certificate):
         doubted |= info["shield_reason"] == NOT_KNOWN_INSIDE
     assert 10 < counted < 150
     assert doubted
-
-
-def test_monitor_keeps_the_proof_while_nothing_unsafe_is_proposed(certificate):
-    env = shielded(certificate, mode="monitor", disturbance=AdversarialDisturbance(certificate.M))
-    gain = certificate.K / env.filter.plant.u_max[:, None]
-    infos = play(env, lambda info: gain @ info["estimate"], seed=0)
-    assert all(info["shield_guaranteed"] for info in infos)
-    assert infos[-1]["episode_interventions"] == 0
