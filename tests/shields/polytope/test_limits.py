@@ -30,8 +30,10 @@ def test_both_engines_prove_it_with_the_same_margins(name):
     assert not found.keeps_ellipsoid
 
 
-@pytest.mark.cases(3)
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name not in ("tanks", "hill", "feedthrough"))) for name in PLANTS],
+)
 def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
     plant, found = PLANTS[name], certificate(name)
     shield, P, rng = safety_filter(found, plant), found.polytope, np.random.default_rng(0)
