@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import cvxpy as cp
 import gymnasium as gym
 import numpy as np
@@ -69,6 +71,19 @@ def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
             np.testing.assert_allclose(decision.input, clipped, atol=1e-6 * plant.input_half.max())
     assert "safe" in reasons
     assert ("fallback" if name == "hill" else "projected") in reasons  # a step moves little of the speed on a hill
+
+
+@pytest.mark.parametrize("name", ["angle", "tanks"])
+def test_boundary_lets_an_input_pass_only_where_both_ends_of_all_inputs_would(name):
+    plant, found, rng = PLANTS[name], certificate(name), np.random.default_rng(0)
+    boundary, switch = (safety_filter(found, plant, mode) for mode in ("boundary", "switch"))
+    P, shape, seen = found.polytope, 1e-4 * found.error_shapes[0], set()
+    for estimate in P.center + (P.sample_boundary(rng, 60) - P.center) * rng.uniform(0.0, 1.0, (60, 1)):
+        corners = map(np.array, product(*plant.input_ends.T))
+        passed = all(switch.decide(estimate, shape, corner).reason == "safe" for corner in corners)
+        assert (boundary.decide(estimate, shape, found.resting_input).reason == "safe") is passed
+        seen.add(passed)
+    assert seen == {True, False}
 
 
 @pytest.mark.cases(5)
