@@ -41,13 +41,15 @@ def test_decision_is_that_of_extreme_points_and_of_a_conic_solver(name):
     shield, P, rng = safety_filter(found, plant), found.polytope, np.random.default_rng(0)
     shape, reasons = 0.5 * found.error_shapes[0], []
     reach = Ellipsoid(shape).support(P.rows @ plant.A) + plant.disturbance.support(P.rows)
-    own = Ellipsoid(shape).support(plant.mixed_rows[:, : plant.n])
+    own, known = (Ellipsoid(shape).support(faces) for faces in (plant.mixed_rows[:, : plant.n], P.rows))
     rows = np.vstack([np.hstack([P.rows @ plant.A, P.rows @ plant.B]), plant.mixed_rows])
     low = np.concatenate([P.low + reach, plant.mixed_ends[0] + own])
     high = np.concatenate([P.high - reach, plant.mixed_ends[1] - own])
     estimates = P.center + (P.sample_boundary(rng, 50) - P.center) * rng.uniform(0.3, 1.1, (50, 1))
     for estimate, proposed in zip(estimates, rng.uniform(*plant.input_ends, (50, plant.m)), strict=True):
         decision = shield.decide(estimate, shape, proposed)
+        inside = min((P.rows @ estimate - P.low - known).min(), (P.high - P.rows @ estimate - known).min())
+        assert abs(inside) < 1e-7 or shield.knows_inside(estimate, shape) == (inside > 0.0)
         values = rows @ np.concatenate([estimate, proposed])
         left = min((values - low).min(), (high - values).min())
         if abs(left) > 1e-7:

@@ -281,13 +281,13 @@ def test_decisions_one_by_one_equal_those_of_a_batch(n, m, mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("kind", ["ellipsoid", "polytope"])
 @pytest.mark.parametrize("states", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_single_decisions_take_off_as_much_for_rounding_as_batches_do(states, mode):
+def test_single_decisions_take_off_as_much_for_rounding_as_batches_do(states, kind, mode):
     # As if float64 had five digits.
     plant = altered(random_plant(states, states, 1), u_max=0.3)
-    shield, rng = safety_filter(certificate_of(plant), plant, mode), np.random.default_rng(0)
-    plain = safety_filter(certificate_of(plant), plant, mode)
-    shield.test.rounding = 1e-5
+    shield, plain = (safety_filter(certificate_of(plant, None, kind), plant, mode) for _ in range(2))
+    shield.test.rounding, rng = 1e-5, np.random.default_rng(0)
     estimates, shapes, inputs = random_cases(rng, shield, 100)
     estimates[20:] *= 10.0
     found, others = many(shield, estimates, shapes, inputs), many(plain, estimates, shapes, inputs)
