@@ -75,6 +75,7 @@ REFUSED = [
     (lambda: requirements(servo(), ages=[]), ValueError, "ages must be different values, at least one"),
     (lambda: requirements(servo(), ages=[-1]), ValueError, "an age must be a whole number >= 0"),
     (lambda: requirements(servo(), resolutions=[np.nan]), ValueError, "a resolution must be"),
+    (lambda: requirements("servo"), ValueError, "plant must be a LinearPlant"),
     (lambda: verify(plant(), kept()), ValueError, "verify takes a Certificate and a LinearPlant"),
     # Fields of certificates.
     (lambda: replace(kept(), proofs=()), CertificateError, "proofs"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ncs_gym import Ellipsoid
+from ncs_gym import Ellipsoid, truck_trailer
 from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.starts import starts_in_box
 from tests.certificates import certificate_of
@@ -63,6 +63,9 @@ def test_a_start_in_the_box_is_decided_to_the_last_digit():
         shape = np.diag(np.full(plant.n, 1e-4)) + (reached**2 - 1e-4) * np.outer(row, row)
         assert Ellipsoid(shape).support(plant.box_rows[2]) == pytest.approx(scale, abs=1e-12)
         assert starts_in_box(plant, Ellipsoid(shape)) is inside
+    # On a face, where products with rows do not round.
+    assert starts_in_box(truck_trailer(), np.array([2.0, -2.0]))
+    assert not starts_in_box(truck_trailer(), np.array([np.nextafter(2.0, 3.0), 0.0]))
 
 
 @pytest.fixture

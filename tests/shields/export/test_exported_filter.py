@@ -270,7 +270,11 @@ def test_the_command_says_what_the_board_needs(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("file", "plant", "words"),
-    [("CartPoleTwoWay", "CartPoleTwoWay", "commits inputs ahead"), ("Convoy", "ConvoyOnRequest", "samples on request")],
+    [
+        ("CartPoleTwoWay", "CartPoleTwoWay", "commits inputs ahead"),
+        ("Convoy", "ConvoyOnRequest", "samples on request"),
+        ("CSTR", "Convoy", "made for another plant"),
+    ],
 )
 def test_what_is_not_exported_is_refused_in_a_sentence(file, plant, words, tmp_path):
     certificate = package.replace("__init__.py", f"{file}-v0.json")

@@ -69,6 +69,8 @@ def test_without_a_polytope_within_the_limits_the_certificate_says_why(monkeypat
         "more than 50 rows, fewer with longer steps or less disturbance; shields keep the state in the ellipsoid"
         in text
     )
+    monkeypatch.setattr(search, "MOST_ROWS", 1)
+    assert "the safe box alone has" in with_polytope(certificate, plant).provenance["no_polytope"]
     monkeypatch.setattr(search, "MOST_ROWS", 400)
     monkeypatch.setattr(search, "MOST_FOLLOWED", 10)
     assert "follows more than 10 rows" in with_polytope(certificate, plant).provenance["no_polytope"]

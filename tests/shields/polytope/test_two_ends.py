@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from ncs_gym import ChannelContract
 from ncs_gym.limits import MovedOperatingPointWarning
 from shields import CertificateError, Infeasible
 from tests.certificates import certificate_of
@@ -41,6 +42,22 @@ def test_limit_with_one_end_alone_is_kept():
     assert found.polytope.high[0] == np.inf
     reached = found.polytope.rows[1:] @ np.array([1e6])
     assert ((reached > found.polytope.high[1:]) | (reached < found.polytope.low[1:])).any()
+
+
+def test_state_without_a_limit_is_bounded_by_what_the_others_allow():
+    model = {"A": [[1.0, 0.1], [0.0, 0.95]], "B": [[0.0], [0.1]], "dt": 0.1, "u_max": 1.0} | QUIET
+    plant = linear_plant(**model, state_limits=([-1.0, -np.inf], [2.0, np.inf]), disturbance_bound=[0.001, 0.01])
+    found = certificate_of(plant, ChannelContract(max_age=2), "polytope")
+    assert verified(found, plant).valid
+    assert np.isfinite(found.polytope.widths).all()
+
+
+def test_disturbance_around_which_nothing_rests_is_refused():
+    settings = {"A": [[0.9]], "B": [[0.0]], "dt": 1.0, "box": 1.0, "u_max": 1.0} | QUIET
+    with pytest.raises(ValueError, match="no state stays where it is"):
+        linear_plant(**settings | {"A": [[1.0]]}, disturbance_bound=([[1.0]], [0.0], [0.1]))
+    with pytest.raises(ValueError, match="not strictly within the limits"):
+        linear_plant(**settings, disturbance_bound=([[1.0]], [0.0], [0.9]))
 
 
 def test_an_input_may_rest_at_an_end_and_a_state_may_not():

@@ -184,6 +184,7 @@ OF_LOOP: list[tuple[bool, Callable[[SafeLoop], Any], type[Exception], str]] = [
         (True, partial(lambda given, loop: loop.receive(echoes=[given]), given), ValueError, NO_ECHO)
         for given in (None, 5, ("1", 0, b"", 0), (1, 0, "", 0), (1, 0))
     ],
+    (True, lambda loop: loop.receive(echoes=[(1, 0, b"", 0)]), ValueError, "echo_age"),
     (False, lambda loop: loop.receive(), RuntimeError, "receive was called twice"),
     (True, lambda loop: loop.decide(0.0), RuntimeError, "decide was called twice"),
     (False, lambda loop: loop.command(), RuntimeError, "call decide before command"),

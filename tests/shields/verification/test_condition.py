@@ -6,11 +6,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from ncs_gym import truck_trailer
+from ncs_gym import Ellipsoid, truck_trailer
 from shields.verification import Condition, Report
 from shields.verification.condition import matrix_condition, scalar_condition
+from tests.certificates import certificate_of
 from tests.product import altered, library_plant, paper_synthesis
-from tests.verdicts import verified
+from tests.shields.verification.test_mutations import replaced
+from tests.verdicts import broken, verified
 
 BEYOND_FLOATS = Fraction(10) ** 400
 
@@ -61,6 +63,14 @@ def test_report_prints_conditions_that_differ_in_the_age_alone_once_and_every_br
     broken = [replace(condition, holds=False) for condition in held[1:]]
     printed = str(Report((held[0], *broken))).splitlines()
     assert [line.split()[0] for line in printed] == ["not", "holds", "BROKEN", "BROKEN"]
+
+
+def test_first_error_that_misses_a_bound_declared_beside_a_covariance_makes_a_certificate_invalid():
+    plant = library_plant(truck_trailer, 4000.0, initial_cov=np.diag([1e-4, 0.0]), initial_bound=([[1.0], [0.3]], 0.02))
+    certificate = certificate_of(plant)
+    assert verified(certificate, plant).valid
+    larger = replaced(plant, initial_bound=Ellipsoid(1.001 * plant.initial_bound.shape_matrix))
+    assert [name[:3] for name in broken(certificate, larger)] == ["r0:"]
 
 
 def test_paper_certificate_proves_nothing_of_bounds_that_its_theorems_do_not_know():
