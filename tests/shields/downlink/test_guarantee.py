@@ -223,22 +223,6 @@ def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
     assert kept > 3
 
 
-def test_resetting_some_environments_makes_no_other_wait_less():
-    waits = []
-    for others in (0, 3):
-        env = vector_env(2, plant=PLANT, downlink=Channel(delay=3), max_episode_steps=50)
-        shield = vector_shield(env, certificate_of(PLANT))
-        _, info = shield.reset(seed=0, options={"state": np.array([[1.99, 1.0], [0.0, 0.0]])})
-        for _ in range(others):
-            options = {"reset_mask": np.array([False, True]), "state": np.zeros((2, 2))}
-            _, info = shield.reset(options=options)
-        waits.append(0)
-        while not info["shield_guaranteed"][0]:
-            *_, info = shield.step(np.zeros((2, 1)))
-            waits[-1] += 1
-    assert waits[0] == waits[1] > 0
-
-
 def test_safe_loop_speaks_the_protocol():
     """A plain loop with an actuator, to which every input comes c steps after it was decided."""
     certificate, rng = certificate_of(PLANT), np.random.default_rng(0)

@@ -15,7 +15,6 @@ from shields import Infeasible, verify
 from tests.certificates import certificate_of
 from tests.product import (
     altered,
-    gym_env,
     safe_loop,
     safety_shield,
     sampled_plant,
@@ -121,11 +120,3 @@ def test_limits_count_beside_times_between_samples():
     names = [condition.name[:4] for condition in verify(found, plant).conditions]
     assert names.count("(PM)") == 1
     assert names.count("(PB)") == 4 * len(plant.box)
-    env = gym_env(plant=plant, channel=CHANNEL, contract=CONTRACT, disturbance="adversarial")
-    shield, rng = safety_shield(env, found), np.random.default_rng(0)
-    shield.reset(seed=0)
-    for _ in range(100):
-        _, _, _, _, info = shield.step(rng.choice([-1.0, 1.0], 1).astype(np.float32))
-        assert info["shield_guaranteed"]
-        assert info["cost"] == 0.0
-        assert len(info["worst_constraint_values"]) == len(plant.box) + 1

@@ -76,22 +76,6 @@ def test_without_a_polytope_within_the_limits_the_certificate_says_why(monkeypat
     assert "follows more than 10 rows" in with_polytope(certificate, plant).provenance["no_polytope"]
 
 
-def small_plant(**changes):
-    """Two states, of which the second is pushed; in the unit box."""
-    given = {"A": [[0.9, 0.2], [0.0, 0.8]], "B": [[0.0], [0.3]], "box": np.eye(2), "u_max": 1.0, "dt": 0.1}
-    noise = {"gamma": 1e-4, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
-    return linear_plant(**(given | noise | changes))
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("again", [[1.0, 0.0], [1.0, 1e-9], [2.0, 0.0]])
-def test_box_with_nearly_the_same_row_twice_has_its_polytope(again):
-    plant = small_plant(box=np.array([[1.0, 0.0], [0.0, 1.0], again]))
-    found = synthesize(plant)
-    assert verified(found, plant).valid
-    assert found.polytope is not None
-
-
 def test_state_that_no_limit_sees_is_limited_so_that_a_polytope_has_an_end():
     plant = linear_plant(
         A=[[0.9, 0.0], [0.0, 0.8]], B=[[0.1], [0.0]], dt=0.1, state_limits=([-1.0, -np.inf], [1.0, np.inf]), u_max=1.0,
