@@ -32,12 +32,7 @@ class Part(NamedTuple):
 
 
 def bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks D, the plant's own sets, and N of a contract, against what the plant declares.
-
-    Args:
-        certificate: The certificate.
-        plant: The plant.
-    """
+    """Checks D, the plant's own sets, and N of a contract, against what the plant declares."""
     D, updates = matrix(certificate.D), certificate.updates
     weight, quantizer = plant.relative_weight, np.eye(plant.p)
     own = matrix(plant.disturbance.shape_matrix)

@@ -62,14 +62,7 @@ def is_semidefinite(symmetric: Any, *, strictly: bool = False) -> bool:
 
 
 def definite(name: str, difference: Any, unit: Any = 1, *, strictly: bool = False) -> Condition:
-    """Returns the condition that a matrix is positive semidefinite (definite if `strictly`).
-
-    Args:
-        name: Name of the condition.
-        difference: The matrix, with denominators multiplied out.
-        unit: The positive number that it was multiplied with.
-        strictly: Whether an eigenvalue of zero is too small.
-    """
+    """Returns the condition that a matrix, times a positive unit, is semidefinite (definite if `strictly`)."""
     holds = is_semidefinite(difference, strictly=strictly)
     try:
         entries = [[float(entry / unit) for entry in row] for row in difference.tolist()]

@@ -18,15 +18,6 @@ def test_files_of_another_kind_are_refused_in_one_sentence(content, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_failed_save_leaves_nothing_behind(certificate, tmp_path):
-    with pytest.raises(FileNotFoundError):
-        certificate.save(tmp_path / "no" / "such" / "folder.json")
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(IsADirectoryError):
-        certificate.save(tmp_path / "folder")
-    assert [entry.name for entry in tmp_path.iterdir()] == ["folder"]
-
-
 def test_a_reader_never_sees_half_a_file(certificate, tmp_path, monkeypatch):
     path = tmp_path / "c.json"
     certificate.save(path)

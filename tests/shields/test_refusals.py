@@ -31,9 +31,9 @@ def kept(name="stable", safe_set="ellipsoid"):
     return certificate_of(*named(name), safe_set)
 
 
-def synthesized(box, gamma=1e-4, A=((0.9, 0.2), (0, 0.8))):
+def synthesized(box, gamma=1e-4):
     noise = {"gamma": gamma, "measurement_noise_cov": 1e-5 * np.eye(2), "initial_cov": 1e-5 * np.eye(2)}
-    return synthesize(linear_plant(A=A, B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
+    return synthesize(linear_plant(A=[[0.9, 0.2], [0, 0.8]], B=[[0], [0.3]], box=box, u_max=1.0, dt=0.1, **noise))
 
 
 def read(**changes):
@@ -50,19 +50,13 @@ def read_multipliers(first):
 
 REFUSED = [
     (lambda: synthesize(plant(), safe_set="Polytope"), ValueError, "safe_set must be"),
-    (lambda: synthesize(plant(), safe_set=0), ValueError, "safe_set must be"),
-    (lambda: synthesize(plant(), safe_set=["polytope"]), ValueError, "safe_set must be"),
     *(
         (
             lambda name=name: paper_synthesis(altered(plant(), **{name: 1e-4})),
             ValueError,
-            rf"knows a Ball of disturbances and Gaussians alone, not another set in Bounds\({given}=...\)",
+            "knows a Ball of disturbances and Gaussians alone",
         )
-        for name, given in (
-            ("disturbance_bound", "disturbance"),
-            ("sensor_bound", "sensor"),
-            ("initial_bound", "first_error"),
-        )
+        for name in ("disturbance_bound", "sensor_bound", "initial_bound")
     ),
     (lambda: paper_synthesis(library_plant(truck_trailer, box=[[0.5, 0.0]])), Infeasible, "unbounded"),
     (
@@ -70,26 +64,12 @@ REFUSED = [
         Infeasible,
         r"take no state to a hundredth of \|x2\| <= 1e\+05 in 2 steps: leave out limits that stand for none",
     ),
-    (
-        lambda: synthesized([1.0, 1e5], A=[[1.0, 0.2], [0, 0.8]]),
-        Infeasible,
-        r"^\(E1\) cannot hold((?!limits that stand for none).)*$",
-    ),
-    (
-        lambda: synthesized([[1.0, 1.0], [1.0, 1.0 + 1e-8]]),
-        Infeasible,
-        r"the safe box is flat, \de\+\d+ times longer in one direction .*: add a limit of x1 or x2, along which it is",
-    ),
-    (
-        lambda: synthesized([1.0, 1e7]),
-        Infeasible,
-        "too ill-conditioned for .* give states units in which the half-widths of the box are of similar size",
-    ),
+    (lambda: synthesized([[1.0, 1.0], [1.0, 1.0 + 1e-8]]), Infeasible, "the safe box is flat, .* a limit of x1 or x2"),
+    (lambda: synthesized([1.0, 1e7]), Infeasible, "too ill-conditioned for .* give states units in which"),
     (lambda: requirements(servo(), ages=[]), ValueError, "ages must be different values, at least one"),
-    (lambda: requirements(servo(), resolutions=[0.1, 0.1]), ValueError, "resolutions must be different values"),
     (lambda: requirements(servo(), ages=[-1]), ValueError, "an age must be a whole number >= 0"),
     (lambda: requirements(servo(), resolutions=[np.nan]), ValueError, "a resolution must be"),
-    (lambda: requirements("servo"), ValueError, "plant must be a LinearPlant, got str"),
+    (lambda: requirements("servo"), ValueError, "plant must be a LinearPlant"),
     (lambda: verify(plant(), kept()), ValueError, "verify takes a Certificate and a LinearPlant"),
     # Fields of certificates.
     (lambda: replace(kept(), proofs=()), CertificateError, "proofs"),
@@ -115,8 +95,7 @@ REFUSED = [
     (lambda: with_proof(kept(), shares=[None, 0.1, 0.1]), CertificateError, r"multipliers of \(I\) must be numbers"),
     # Files whose checksum fits.
     (lambda: read(safe_set={"L": [[float("nan"), 0.0], [0.0, 1.0]]}), CertificateError, "certificate"),
-    (lambda: read(K="no"), CertificateError, "certificate"),
-    (lambda: read(errors={}), CertificateError, "certificate"),
+    (lambda: read(Sigma=[[1.0]]), CertificateError, "certificate"),
     (lambda: read(errors=3), CertificateError, "certificate"),
     *(
         (lambda entry=entry: read_multipliers(entry), CertificateError, "certificate")

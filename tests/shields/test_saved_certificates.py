@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shields import Certificate, CertificateError, Infeasible
+from shields import Certificate, CertificateError
 from shields.polytope import MOST_MULTIPLIERS, MOST_ROWS, Polytope
-from shields.synthesis import invariant_polytope
 
 
 def with_polytope(certificate, rows, multipliers, seed=0):
@@ -33,17 +32,3 @@ def test_document_of_any_polytope_is_read_again(certificate, rows, multipliers, 
 def test_polytope_that_could_not_be_read_again_cannot_be_made(rows, multipliers):
     with pytest.raises(CertificateError, match=f"at most {MOST_ROWS} rows and {MOST_MULTIPLIERS} rows of multipliers"):
         Polytope(rows=np.ones((rows, 1)), multipliers=np.zeros((multipliers, rows)))
-
-
-def test_search_ends_with_no_more_rows_than_a_polytope_may_have(monkeypatch):
-    """The row that is followed last adds one to as many as there may be."""
-    monkeypatch.setattr(invariant_polytope, "MOST_ROWS", 20)
-    angles = np.linspace(0.0, np.pi, 21, endpoint=False)
-    rows = np.column_stack([np.cos(angles), np.sin(angles)])
-
-    def predecessor(face):
-        return face._replace(rows=rows[-1:] if np.array_equal(face.rows, rows[-2:-1]) else 0.5 * face.rows)
-
-    faces = invariant_polytope.Faces(rows[:-1], -np.ones(20), np.ones(20))
-    with pytest.raises(Infeasible, match="more than 20 rows"):
-        invariant_polytope.invariant_faces(faces, predecessor, 2)

@@ -9,22 +9,19 @@ import pytest
 from scipy.optimize import linprog
 
 import shields
-from ncs_gym import Channel, ChannelContract, Packet, TraceChannel
+from ncs_gym import Channel, ChannelContract, Packet
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.estimation.kalman_filter import ErrorRecursion
-from ncs_gym.network.channel import in_time
 from shields import CertificateError, certificate_for
-from shields.silence import MOST_STEPS, way_back
+from shields.silence import MOST_STEPS
 from shields.synthesis.faces import Extremes, Faces
 from shields.synthesis.polytope_certificates import certified_polytope
 from shields.synthesis.resting_point import at_operating_point
 from tests.certificates import certificate_of
 from tests.plants import small
-from tests.product import linear_plant, sampled_plant, vector_env, vector_shield
+from tests.product import linear_plant
 
 CASES = ("CartPole", "CSTR", "Convoy", "Pendulum", "drifts", "open")
-HEARD, SILENT = 24, 80
 
 
 @cache
@@ -153,36 +150,6 @@ def test_a_resting_point_that_is_no_equilibrium_moves_the_estimate():
     assert not keeps_box(plant, extremes(plant, moved, 0, steps + 1, 0.0)[0], -1e-6)
 
 
-def test_box_is_kept_in_silence_whatever_an_agent_does():
-    plant, certificate, found = registered("drifts")
-    h = certificate.contract.max_age
-    assert found.anywhere > 10
-    ellipsoid = certificate_for(plant, certificate.contract, "ellipsoid")
-    assert shields.silence_of(ellipsoid, plant).anywhere >= found.anywhere
-    trace = [0 if k % (h + 1) == 0 else -1 for k in range(HEARD)] + [-1] * 200
-    settings = {"disturbance": "adversarial", "terminate_on_violation": False, "max_episode_steps": 1000}
-    env = vector_env(
-        64, plant=plant, channel=TraceChannel(trace=tuple(trace)), contract=certificate.contract, **settings
-    )
-    shield, rng = vector_shield(env, certificate, on_unproved="ignore"), np.random.default_rng(0)
-    shield.reset(seed=0)
-    pushed, ages, outside = rng.choice([-1.0, 1.0], (64, 1)).astype(np.float32), [], []
-    for _ in range(len(trace) - 1):
-        *_, info = shield.step(pushed)
-        ages.append(info["measurement_age"].max())
-        outside.append((info["cost"] > 0.0).any())
-    assert not any(outside[: ages.index(h + 1) + found.anywhere])
-    assert any(outside)
-
-
-def test_it_is_said_in_words_that_fit_a_terminal():
-    found = registered("drifts")[2]
-    text = " ".join(str(found).split())
-    assert f"is {6 + found.anywhere} steps ({in_time(0.1 * (6 + found.anywhere))}) old" in text
-    assert "after 12, 60 and 600 steps" in text
-    assert max(map(len, str(found).splitlines())) <= 80
-
-
 @pytest.mark.parametrize("size", [1.0, 1e-12, 1e12])
 def test_bounds_of_rows_hold_whatever_the_solver_says(size):
     """Also where its tolerances are far too coarse, and close to the best ones where they are not."""
@@ -220,15 +187,6 @@ def test_ways_back_are_those_of_an_estimator_with_as_few_samples_as_the_contract
                 assert certified or 5 * period < step < first + said
                 assert not (certified and first <= step < first + said)
     assert not contract.is_kept_by(Channel(send_period=contract.max_age + 2))
-
-
-def test_way_back_from_an_outage_after_which_the_covariance_is_no_longer_positive():
-    plant = sampled_plant(
-        ([[0.0, 1.0], [12.0, -0.3]], [[0.0], [4.0]], [[1.0, 0.0]], [[0.0]]), dt=0.02, box=[0.2, 1.0], u_max=3.0,
-        disturbance_bound=[2e-4, 3e-3], sensor_bound=5e-4, initial_bound=[2e-3, 1e-2],
-    )  # fmt: skip
-    recursion = ErrorRecursion(plant, 0.0, certified_error_set(plant, ChannelContract(4)))
-    assert 1 <= way_back(recursion, 400, 5) < 100
 
 
 def test_certificates_of_other_plants_are_refused():

@@ -8,7 +8,6 @@ from collections import Counter
 from contextlib import contextmanager
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -18,7 +17,7 @@ from shields.runtime import safety_filter
 from shields.runtime.backup_plans import plan_check
 from shields.runtime.guarantee import OLD_SAMPLE
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
-from tests.product import altered, safety_shield
+from tests.product import altered
 from tests.shields.attacks.cases import CASES, RANDOM, case
 from tests.shields.attacks.worlds import (
     AGE,
@@ -81,7 +80,7 @@ def campaign() -> list:
     return rows
 
 
-@pytest.mark.cases(14)
+@pytest.mark.cases(10)
 @pytest.mark.parametrize(("name", "mode", "through", "is_whole"), campaign())
 def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
     first = [*CASES].index(name) + MODES.index(mode)
@@ -105,7 +104,7 @@ def test_nothing_that_is_claimed_is_false(name, mode, through, is_whole):
         assert counts["guaranteed"] > 0.3 * counts["steps"]
 
 
-@pytest.mark.cases(5)
+@pytest.mark.cases(3)
 @pytest.mark.parametrize(("count", "steps"), [(30, 50), pytest.param(200, 500, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_errors_stay_in_their_ellipsoids_and_these_in_the_certified_ones(name, count, steps):
@@ -139,7 +138,7 @@ def test_errors_that_came_back_into_certified_sets_stay_there_while_the_contract
     assert min(outcome.counts["lost"], outcome.counts["certified again"]) > 0
 
 
-@pytest.mark.cases(4)
+@pytest.mark.cases(2)
 @pytest.mark.parametrize(
     ("name", "seed"),
     [
@@ -193,19 +192,6 @@ def tightened_less(patch, left_out):
     yield {}
 
 
-@contextmanager
-def plans_turned_round(patch):
-    """What is stored is not what was certified."""
-    decide = SafetyFilter.decide
-
-    def turned(*arguments):
-        decision = decide(*arguments)
-        return decision if decision.stored else decision._replace(plan=-decision.plan)
-
-    patch.setattr(SafetyFilter, "decide", turned)
-    yield {}
-
-
 def without_the_grid(name):
     """A case whose box is certified at the sampling instants alone, and which is judged at all times."""
     timed = case(name)
@@ -220,7 +206,6 @@ def tried(patch, defect, name, mode, through):
         "set enlarged": lambda: set_enlarged(patch, of),
         "plans checked with nothing": lambda: tightened_less(patch, "everything"),
         "plans checked with two disturbances less": lambda: tightened_less(patch, 2),
-        "plans turned round": lambda: plans_turned_round(patch),
     }
     worlds = {
         "no filter": {},
@@ -269,7 +254,6 @@ TWINS = {
     "times between samples not counted": ((ALL_TIMES,), each(AT_ALL_TIMES[:2], MODES, VECTOR), False, 1),
     "plans checked with nothing": ((BOX,), each(PLANNED, ["lookahead"], VECTOR), False, 1),
     "plans checked with two disturbances less": ((BOX,), each(PLANNED, ["lookahead"], LOOP), False, 1),
-    "plans turned round": ((BOX,), each(PLANNED[:3], ["lookahead"], LOOP), False, 1),
 }
 
 
@@ -281,7 +265,7 @@ def twins() -> list:
     ]
 
 
-@pytest.mark.cases(10)
+@pytest.mark.cases(9)
 @pytest.mark.parametrize(("defect", "name", "mode", "through"), twins())
 def test_the_adversary_catches(defect, name, mode, through, monkeypatch):
     claims, _, anyway, _ = TWINS[defect]
@@ -307,18 +291,3 @@ def test_broken_contract_ends_the_guarantee_before_anything_is_left(name, mode):
     assert max(outcome.largest[claim] for claim in STATE) <= 1.0 < outcome.ever[BOX]
     assert outcome.lost == {OLD_SAMPLE}
     assert 0 < outcome.counts["guaranteed"] < outcome.counts["steps"]
-
-
-@pytest.mark.cases(3)
-@pytest.mark.parametrize("mode", ["project", "lookahead"])
-@pytest.mark.parametrize("env_id", ["TruckTrailerCruise", "CartPole", "BatchReactor"])
-def test_registered_environments_are_shielded_as_they_come(env_id, mode):
-    made = lambda: gym.make(f"ncs_gym/{env_id}-v0", disturbance="adversarial", terminate_on_violation=False)  # noqa: E731
-    rng, shielded, bare = np.random.default_rng(0), safety_shield(made(), mode=mode), made()
-    for env, is_left in ((shielded, False), (bare, True)):
-        env.reset(seed=0)
-        for _ in range(120):
-            action = np.where(rng.random(env.action_space.shape) < 0.9, 1.0, -1.0).astype(np.float32)
-            *_, info = env.step(action)
-            assert info.get("shield_guaranteed", True)
-        assert (info["episode_violations"] > 0.0) is is_left

@@ -3,7 +3,6 @@
 The campaign attacks the same families in every mode (cases.py); here members are chosen, and moved by hand.
 """
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,7 +16,6 @@ from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
 from tests.certificates import certificate_of
 from tests.plants import varying_cart_pole, varying_truck
 from tests.product import altered, family_of, safe_loop, sampled_plant, vector_env, vector_shield
-from tests.verdicts import verified
 
 FAMILIES = {
     "truck": (varying_truck, {"channel": CASE_STUDY_CHANNEL}, "ellipsoid"),
@@ -80,7 +78,7 @@ def certified(name, plant=None):
 
 
 @pytest.mark.parametrize(("count", "steps"), SIZES)
-@pytest.mark.parametrize("mode", ["project", "boundary", "lookahead"])
+@pytest.mark.parametrize("mode", ["project", "lookahead"])
 @pytest.mark.parametrize("name", FAMILIES)
 def test_no_member_leaves_what_is_certified_for_all(name, mode, count, steps):
     counts = attacked(name, FAMILIES[name][0](), certified(name), count, steps, mode)
@@ -102,15 +100,6 @@ def test_certificate_of_the_middle_alone_does_not_hold_and_that_is_seen(name):
     assert name != "truck" or counts["unsafe"] > 100
 
 
-@pytest.mark.parametrize("name", FAMILIES)
-def test_both_verifiers_agree_and_refuse_the_certificate_of_the_middle(name):
-    family = FAMILIES[name][0]()
-    assert verified(certified(name), family).valid
-    bare = altered(family, remainder=None)
-    wrong = replace(certified(name, bare), fingerprint=family.fingerprint)
-    assert not verified(wrong, family).valid
-
-
 @pytest.mark.parametrize(("count", "steps"), SIZES)
 def test_members_may_change_from_step_to_step(count, steps):
     plant, rng = varying_truck(), np.random.default_rng(5)
@@ -126,40 +115,22 @@ def test_members_may_change_from_step_to_step(count, steps):
     assert counts["held"] == count * (steps // 2)
 
 
-def gains(**settings):
-    """The hull of three plants: two gains, and other poles with one of them."""
-    given = {"box": [1.0, 1.0], "u_max": 1.0, "disturbance_bound": 0.01, "sensor_bound": 0.002, "initial_bound": 0.005}
-    given |= settings
-    if "state_limits" in given:
-        del given["box"], given["u_max"]
+def gains():
+    """The hull of three plants with limits of every kind: two gains, and other poles with one of them."""
+    given = {"disturbance_bound": 0.01, "sensor_bound": 0.002, "initial_bound": 0.005, "du_max": 0.4}
+    given |= {"state_limits": ([-0.6, -1.0], [1.0, 0.7]), "input_limits": (-0.5, 1.0)}
+    given |= {"mixed_limits": [([0.0, 1.0], [0.5], -1.1, 1.1)]}
     moving = [([[0.9, 0.1], [0.0, 0.8]], 0.28), ([[0.9, 0.1], [0.0, 0.8]], 0.3), ([[0.89, 0.1], [0.01, 0.8]], 0.3)]
     return family_of(
         [sampled_plant((A, [[0.0], [gain]], np.eye(2), np.zeros((2, 1)), 0.1), **given) for A, gain in moving]
     )
 
 
-LIMITS = {
-    "input delay": {"input_delay": 1},
-    "limits of rates": {"du_max": 0.4},
-    "two ends": {"state_limits": ([-0.6, -1.0], [1.0, 0.7]), "input_limits": (-0.5, 1.0)},
-    "both together": {"mixed_limits": [([0.0, 1.0], [0.5], -1.1, 1.1)]},
-    "a downlink": {},
-}
-
-
 @pytest.mark.parametrize(("count", "steps"), [(30, 60), pytest.param(200, 300, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", LIMITS)
-def test_members_keep_limits_of_every_kind(kind, count, steps):
-    plant = gains(**LIMITS[kind])
-    downlink = Channel(delay=1, loss=0.4, max_consecutive_losses=1) if kind == "a downlink" else None
-    many = vector_env(
-        count,
-        plant=plant,
-        channel=Channel(loss=0.4, delay=1),
-        downlink=downlink,
-        disturbance="adversarial",
-        noise="extreme",
-    )
+def test_members_keep_limits_of_every_kind_behind_a_downlink(count, steps):
+    plant, downlink = gains(), Channel(delay=1, loss=0.4, max_consecutive_losses=1)
+    worst = {"disturbance": "adversarial", "noise": "extreme"}
+    many = vector_env(count, plant=plant, channel=Channel(loss=0.4, delay=1), downlink=downlink, **worst)
     certificate = certificate_of(plant, many.certificate_contract, "polytope")
     shield = vector_shield(many, certificate, on_unproved="ignore")
     rng = np.random.default_rng(0)
@@ -167,10 +138,7 @@ def test_members_keep_limits_of_every_kind(kind, count, steps):
     act, held, near, overridden = hostile_agents(certificate, plant, count, rng), 0, -1.0, 0
     for _ in range(steps):
         *_, info = shield.step(act(info["estimate"]))
-        proved, worst = (
-            info["shield_guaranteed"],
-            info.get("worst_constraint_values", info["constraint_values"]).max(axis=1),
-        )
+        proved, worst = info["shield_guaranteed"], info["worst_constraint_values"].max(axis=1)
         assert not (proved & ((info["cost"] > 0.0) | info["assumption_violated"])).any()
         low, high = plant.input_ends
         assert ((low <= info["input"]) & (info["input"] <= high)).all()

@@ -10,8 +10,6 @@ import pytest
 
 from ncs_gym import Ellipsoid
 from ncs_gym.uncertainty.ellipsoid import outer_sum
-from shields import SafetyFilter
-from shields.runtime.backup_plans import plan_search
 from tests.certificates import metric
 from tests.product import safety_filter
 from tests.shields.attacks.cases import case
@@ -118,18 +116,6 @@ def test_plans_are_what_they_say():
     assert {"safe", "planned"} <= seen
 
 
-@pytest.mark.parametrize("name", ["cruise", "batch reactor"])
-def test_an_input_that_passes_todays_test_starts_no_search_and_clears_the_store(name, monkeypatch):
-    shield = shield_of(name)
-    monkeypatch.setattr(plan_search.Planner, "find", None)
-    stored = np.zeros((2, shield.plant.m))
-    decision = shield.decide(
-        np.zeros(shield.plant.n), 1e-6 * shield.certificate.Sigma, np.zeros(shield.plant.m), stored
-    )
-    assert decision.reason == "safe"
-    assert len(decision.plan) == 0
-
-
 @pytest.mark.cases(2)
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_certified_means_the_next_stored_input_and_without_any_the_gain(name):
@@ -172,20 +158,6 @@ def test_what_cannot_be_used_means_the_next_stored_input(what):
     assert shield.decide(*case.values()).reason == "invalid"
 
 
-@pytest.mark.parametrize("mode", ["project", "switch", "boundary", "monitor"])
-def test_other_modes_keep_no_plan(mode, certificate, loaded):
-    shield = safety_filter(certificate, loaded, mode)
-    for u in (0.0, 4.0):
-        decision = shield.decide(np.array([1.8, 0.5]), 0.1 * certificate.Sigma, np.array([u]), [[1.0]])
-        assert decision.plan.shape == (0, 1)
-        assert decision.stored is False
-        many = shield.decide_many(
-            np.full((2, 2), 0.5), 0.1 * certificate.Sigma, np.full((2, 1), u), np.empty((2, 0, 1))
-        )
-        assert many.plan.shape == (2, 0, 1)
-    assert shield.first_plan(np.zeros(2), shield.errors_of(0.1 * certificate.Sigma)).shape == (0, 1)
-
-
 @pytest.mark.parametrize("name", ["cruise", "n=4 m=3 p=2"])
 def test_horizon_of_one_is_mode_project(name):
     shield, rng = shield_of(name, 1), np.random.default_rng(3)
@@ -220,7 +192,7 @@ class NoArray:
 
 
 NO_PLANS = (
-    *(None, "plan", np.nan, NoArray(), [[1.0], []], [[1.0], [1.0, 2.0]], [np.ones(1), np.ones(2)]),
+    *(None, "plan", NoArray(), [[1.0], [1.0, 2.0]]),
     *(np.zeros((2, 2)), np.full((1, 1), np.nan), np.full((1, 1), 1e9), np.ones((99, 1))),
 )
 
@@ -234,6 +206,9 @@ def test_what_is_no_plan_counts_as_none_stored():
         for one, other in zip(expected, decisions(shield, cases, stored), strict=True):
             assert one.reason == other.reason
             np.testing.assert_array_equal(one.input, other.input)
+    for one, other in zip(expected, decisions(shield, cases, np.zeros((2, 1))), strict=True):
+        assert one.reason != "projected" or other.reason in ("projected", "planned")
+        assert other.reason != "projected" or len(other.plan) == 0  # nothing is left of the plan before
     for stored in (*NO_PLANS, [[4.1]], np.zeros((9, 1))):  # beyond the limits, and longer than plans are
         decision = far.decide(np.full(2, 30.0), 0.1 * far.certificate.Sigma, np.zeros(1), stored)
         assert decision.reason == "fallback"
@@ -252,26 +227,6 @@ def test_decisions_one_by_one_equal_those_of_a_batch(name):
     estimates[::9] *= 3.0
     many = decided_alike(shield, estimates, shapes, proposed, stored)
     assert {"planned", "stored"} <= set(many.reason)
-
-
-@pytest.mark.cases(2)
-@pytest.mark.parametrize("name", NAMES)
-def test_a_single_proposal_that_a_gain_continues_is_kept_without_a_batch(name, monkeypatch):
-    shield, rng = shield_of(name), np.random.default_rng(7)
-    cases = list(zip(*situations(shield, rng, 150), strict=True))
-    kept = [(case, one) for case in cases if (one := shield.decide(*case)).reason == "planned" and not one.intervened]
-    monkeypatch.setattr(SafetyFilter, "decide_columns", None)
-    decided = 0
-    for (x_hat, shape, proposed), expected in kept:
-        try:
-            one = shield.decide(x_hat, shape, proposed)
-        except TypeError:  # it needed a batch
-            continue
-        decided += 1
-        assert (one.intervened, one.proved, one.fallback, one.stored) == (False, True, False, False)
-        np.testing.assert_array_equal(one.input, proposed)
-        np.testing.assert_array_equal(one.plan, expected.plan)
-    assert decided > 0.6 * len(kept) > 0
 
 
 def broken_solver(how, rng):
@@ -295,10 +250,9 @@ def broken_solver(how, rng):
                 fail()
             x = {
                 "NaN": np.full(self.size, np.nan),
-                "infinite": np.full(self.size, np.inf),
                 "too short": np.zeros(self.size - 1),
                 "garbage": rng.uniform(-1, 1, self.size),
-                "beyond the limits": rng.uniform(-9, 9, self.size),
+                "too large": rng.uniform(-9, 9, self.size),
                 "nothing": None,
             }.get(how)
             return SimpleNamespace(x=x, status="Solved")
@@ -306,17 +260,7 @@ def broken_solver(how, rng):
     return Solver
 
 
-FAILURES = [
-    "raises when made",
-    "raises when updated",
-    "raises",
-    "NaN",
-    "infinite",
-    "too short",
-    "garbage",
-    "beyond the limits",
-    "nothing",
-]
+FAILURES = "raises when made", "raises when updated", "raises", "NaN", "too short", "garbage", "too large", "nothing"
 
 
 def break_solver(monkeypatch, how, rng):

@@ -55,27 +55,6 @@ def shielded(mode="project", start=0.3, kind=loop_env, **settings):
     return safety_shield(env, certificate, mode=mode)
 
 
-def levels(shield, info):
-    return shield.certificate.safe_set.gauge(info["state"])
-
-
-@pytest.mark.parametrize(("input_delay", "size"), [(1, 1.001), (1, 1.1), (3, 1.001), (3, 1.2)])
-def test_a_guarantee_that_is_regained_is_one_about_the_present_and_every_step_until_the_next_input(input_delay, size):
-    shield = shielded(downlink=Channel(delay=input_delay), disturbance="sphere", start=1e-3)
-    # Outside S, drifting back in: an estimate is that of c steps later.
-    start = size * np.array([1.0, 0.0]) / np.sqrt(metric(shield.certificate)[0, 0])
-    _, info = shield.reset(seed=0, options={"state": start})
-    inside, guaranteed = [each.in_safe_set for each in starts_known(shield.filter, start, input_delay)], []
-    for step in range(30):
-        known = shield.filter.knows_inside(info["estimate"], info["error_shape"])
-        inside = [*inside, known] if step else [*inside[:-1], inside[-1] or known]
-        guaranteed.append(info["shield_guaranteed"])
-        assert levels(shield, info) <= 1.0 or not guaranteed[-1]
-        *_, info = shield.step(np.zeros(1))
-    assert guaranteed == [all(inside[step : step + input_delay + 1]) for step in range(30)]
-    assert 0 < guaranteed.index(True) < 5
-
-
 def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
     shield, input_delay = shielded().filter, 3
     small, large = (Ellipsoid(scale**2 * shield.certificate.safe_set.shape_matrix) for scale in (0.3, 0.999999))
@@ -84,15 +63,6 @@ def test_first_steps_are_known_exactly_where_they_can_leave_the_safe_set():
     assert known[0].in_safe_set
     assert not all(each.in_safe_set for each in known)
     assert [each.in_safe_set for each in starts_known(shield, None, input_delay)] == [False] * 4
-    rng = np.random.default_rng(0)
-    for scale in (0.5, 0.9, *np.linspace(0.95, 0.999, 40)):
-        start = large.sample_boundary(rng) * scale
-        found = starts_known(shield, start, input_delay)
-        states = np.tile(start, (200, 1))
-        for each in found:
-            gauges = shield.certificate.safe_set.gauge(states)
-            assert not each.in_safe_set or gauges.max() <= 1.0
-            states = states @ PLANT.A.T + PLANT.disturbance.sample_boundary(rng, 200)
 
 
 def test_a_given_start_is_followed_under_zero_input():
@@ -120,7 +90,7 @@ def test_a_given_start_is_followed_under_zero_input():
 
 @pytest.mark.cases(1)
 @pytest.mark.parametrize("count", [16, pytest.param(300, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("size", [1.0, 1e7, 1e11])
+@pytest.mark.parametrize("size", [1e11, 1.0, 1e7])
 def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_does(size, count):
     # Starts that A annihilates, but for the rounding of products of huge numbers.
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
@@ -140,7 +110,7 @@ def test_a_start_however_far_out_is_known_to_move_into_the_safe_set_only_if_it_d
 
 @pytest.mark.cases(1)
 @pytest.mark.parametrize("count", [6, pytest.param(120, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("size", [1.0, 2.0**10, 2.0**20])
+@pytest.mark.parametrize("size", [2.0**20, 1.0, 2.0**10])
 def test_starts_along_a_line_that_moves_into_the_safe_set_are_known_to_only_if_they_do(size, count):
     settings = {"u_max": 1.0, "dt": 0.1, "disturbance_bound": 1e-9, "sensor_bound": 0.0, "initial_bound": 0.0}
     plant = linear_plant(A=[[0.9, -0.45], [0.45, -0.225]], B=np.ones((2, 1)), box=np.eye(2), **settings)
@@ -241,24 +211,6 @@ def test_other_inputs_than_decided_end_the_guarantee(key, reason):
     assert shield.step(np.array([0.2]))[4]["shield_guaranteed"]
 
 
-@pytest.mark.parametrize("late", [False, True])
-def test_a_late_input_drops_the_plan_that_was_certified_for_its_being_on_time(late):
-    settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
-    env = loop_env(UNSTABLE.plant, **settings)
-    meddler = Meddler(env, "applied")
-    shield, kept = safety_shield(env, UNSTABLE.certificate, "lookahead"), 0
-    rng, push = np.random.default_rng(0), np.ones(1, np.float32)
-    for seed in range(15):
-        meddler.active = False
-        _, info = shield.reset(seed=seed, options={"state": UNSTABLE.certificate.safe_set.sample_boundary(rng)})
-        meddler.active = late
-        *_, info = shield.step(push)
-        assert not late or info["shield_reason"] == LATE_INPUT
-        assert not late or info["shield_plan_length"] == 0
-        kept += info["shield_plan_length"] > 0
-    assert late or kept > 3
-
-
 def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
     settings = {"channel": UNSTABLE.uplink, "contract": UNSTABLE.contract, "downlink": UNSTABLE.downlink}
     env = vector_env(6, plant=UNSTABLE.plant, **settings)
@@ -275,26 +227,10 @@ def test_late_inputs_drop_the_plans_of_their_own_environments_in_a_vector():
     assert kept > 3
 
 
-def test_resetting_some_environments_makes_no_other_wait_less():
-    waits = []
-    for others in (0, 3):
-        env = vector_env(2, plant=PLANT, downlink=Channel(delay=3), max_episode_steps=50)
-        shield = vector_shield(env, certificate_of(PLANT))
-        _, info = shield.reset(seed=0, options={"state": np.array([[1.99, 1.0], [0.0, 0.0]])})
-        for _ in range(others):
-            options = {"reset_mask": np.array([False, True]), "state": np.zeros((2, 2))}
-            _, info = shield.reset(options=options)
-        waits.append(0)
-        while not info["shield_guaranteed"][0]:
-            *_, info = shield.step(np.zeros((2, 1)))
-            waits[-1] += 1
-    assert waits[0] == waits[1] > 0
-
-
-@pytest.mark.parametrize("downlink", [Channel(delay=2), KEPT, Channel(loss=0.5, jitter=3, max_consecutive_losses=2)])
-def test_safe_loop_speaks_the_protocol(downlink):
+def test_safe_loop_speaks_the_protocol():
     """A plain loop with an actuator, to which every input comes c steps after it was decided."""
     certificate, rng = certificate_of(PLANT), np.random.default_rng(0)
+    downlink = Channel(loss=0.5, jitter=3, max_consecutive_losses=2)
     loop = safe_loop(certificate, PLANT, UPLINK, downlink=downlink)
     actuator = Actuator(loop.input_delay, PLANT.m)
     up, down = ChannelState(UPLINK, rng), ChannelState(downlink, rng)
@@ -302,7 +238,7 @@ def test_safe_loop_speaks_the_protocol(downlink):
     loop.start(state + PLANT.of_first_error.drawn(rng))
     actuator.start(loop.episode)
     packets, applied, scheduled, worst = [], None, [np.zeros(1)] * loop.input_delay, 0.0
-    for step in range(300):
+    for step in range(200):
         loop.receive(packets, applied)
         assert loop.guaranteed
         worst = max(worst, certificate.safe_set.gauge(state))
@@ -316,25 +252,3 @@ def test_safe_loop_speaks_the_protocol(downlink):
         sample = PLANT.H @ state + PLANT.of_sensor.drawn(rng) if up.sends_at(step + 1) else None
         packets = up.exchange(rng, step + 1, sample, loop.episode)
     assert 0.8 < worst <= 1.0
-
-
-def test_actuator_takes_the_newest_command_of_its_episode_and_repeats_nothing():
-    actuator = Actuator(2, 1)
-    plain = safe_loop(certificate_of(PLANT), PLANT, UPLINK, downlink=Channel(delay=2))
-    plain.start(np.zeros(2))
-    commands = []
-    for _ in range(4):
-        plain.step(1.0)
-        commands.append(plain.command())
-    actuator.start(episode=0)
-    actuator.receive([commands[3], commands[1], commands[1]])
-    np.testing.assert_array_equal(actuator.apply(3), commands[1].inputs[2])
-    np.testing.assert_array_equal(actuator.apply(5), commands[3].inputs[2])
-    np.testing.assert_array_equal(actuator.apply(6), 0.0)
-    assert actuator.missing
-    np.testing.assert_array_equal(actuator.apply(1), 0.0)
-    assert not actuator.missing
-    actuator.start(episode=1)
-    actuator.receive(commands)
-    np.testing.assert_array_equal(actuator.apply(4), 0.0)
-    assert actuator.missing

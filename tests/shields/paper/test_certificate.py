@@ -9,7 +9,7 @@ from ncs_gym import truck_trailer
 from shields import Infeasible, verify
 from shields.paper.bounds import PaperModel
 from shields.paper.feasibility import FeasibilityScan, largest_scale
-from tests.product import altered, library_plant, paper_synthesis, safety_filter, safety_shield
+from tests.product import library_plant, paper_synthesis, safety_filter, safety_shield
 from tests.verdicts import broken, verified
 
 SMALL = library_plant(truck_trailer, gamma=1e-6, process_noise_cov=1e-6 * np.eye(2))
@@ -51,24 +51,6 @@ def test_reported_scale_is_feasible_and_a_little_more_is_not():
     assert verified(paper_synthesis(scaled(0.97), dkappa=0.005, drho=0.01), scaled(0.97)).valid
     with pytest.raises(Infeasible):
         paper_synthesis(scaled(1.05), dkappa=0.05, drho=0.05)  # proven over the whole domain, whatever the grid
-
-
-@pytest.mark.parametrize("unit", [1e-3, 1e4])
-def test_units_of_the_state_change_nothing(unit, paper):
-    scaled = altered(
-        SMALL,
-        B=SMALL.B * unit,
-        continuous_model=None,
-        box=SMALL.box_rows / unit,
-        gamma=SMALL.gamma * unit**2,
-        process_noise_cov=SMALL.process_noise_cov * unit**2,
-        measurement_noise_cov=SMALL.measurement_noise_cov * unit**2,
-        initial_cov=SMALL.initial_cov * unit**2,
-    )
-    certificate = paper_synthesis(scaled)
-    assert verified(certificate, scaled).valid
-    assert (certificate.kappa, certificate.rho) == (paper.kappa, paper.rho)
-    np.testing.assert_allclose(certificate.L / unit**2, paper.L, rtol=1e-4)
 
 
 def test_no_uncertainty_at_all_is_no_division_by_zero():

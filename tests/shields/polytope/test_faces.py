@@ -10,7 +10,6 @@ from scipy.optimize import linprog
 
 from shields.synthesis import faces as synthesis_faces
 from shields.synthesis.faces import Extremes, Faces, multipliers_of
-from tests.product import linear_plant, synthesize
 
 
 def faces_of(rng, r, n, *, symmetric=False, some_open=True):
@@ -72,12 +71,6 @@ def test_what_has_no_end_is_infinite_and_later_faces_give_it_one():
     assert within.of(np.array([0.0, 1.0])) == (-math.inf, pytest.approx(2.0))
 
 
-def test_the_given_faces_stay_as_they_are():
-    faces = Faces(np.eye(2), -np.ones(2), np.ones(2))
-    Extremes(faces).set_ends(0, -2.0, 2.0)
-    np.testing.assert_array_equal(faces.high, 1.0)
-
-
 @pytest.mark.parametrize("number", [math.nan, math.inf, 1e300])
 def test_numbers_out_of_reach_are_refused(number):
     rows = np.array([[number, 1.0]])
@@ -86,17 +79,6 @@ def test_numbers_out_of_reach_are_refused(number):
     within = Extremes(Faces(np.eye(2), -np.ones(2), np.ones(2)))
     with pytest.raises(ArithmeticError, match="numbers from 1e\\+15 on"):
         within.of(rows[0])
-
-
-def test_solvers_print_nothing(capfd):
-    faces = Faces(np.eye(2), -np.ones(2), np.ones(2))
-    assert Extremes(faces).of(np.array([1.0, 2.0])) == (-3.0, 3.0)
-    plant = linear_plant(
-        A=[[0.9, 0.1], [0.0, 0.8]], B=[[0.0], [0.3]], dt=0.1, box=[1.0, 2.0], u_max=3.0,
-        disturbance_bound=0.01, sensor_bound=0.01, initial_bound=0.01,
-    )  # fmt: skip
-    assert hasattr(synthesize(plant, safe_set="polytope").safe_set, "rows")
-    assert capfd.readouterr() == ("", "")
 
 
 def test_presolve_that_fails_is_repeated_without_one(monkeypatch):

@@ -15,7 +15,6 @@ from shields import Infeasible, verify
 from tests.certificates import certificate_of
 from tests.product import (
     altered,
-    gym_env,
     safe_loop,
     safety_shield,
     sampled_plant,
@@ -30,7 +29,6 @@ from tests.shields.polytope.limits import (
     PLANTS,
     QUIET,
     certificate,
-    mixed_values,
 )
 from tests.verdicts import verified
 
@@ -52,24 +50,6 @@ def test_fallback_keeps_every_limit_from_every_state_by_linear_programs(name):
             assert -best.fun + sign * constant + reach <= end + 1e-9
 
 
-@pytest.mark.cases(1)
-@pytest.mark.parametrize("name", ["rates", "feedthrough", "coupled"])
-def test_unshielded_steps_beyond_a_limit_are_counted(name):
-    plant, rng = PLANTS[name], np.random.default_rng(1)
-    env = gym_env(plant=plant, channel=CHANNEL, contract=CONTRACT)
-    _, info = env.reset(seed=0)
-    counted = 0
-    for _ in range(60):
-        state = info["state"]
-        _, _, _, _, info = env.step(rng.choice([-1.0, 1.0], plant.m).astype(np.float32))
-        beyond = mixed_values(plant, state[None], info["input"][None]).max() > 0.0
-        outside = plant.constraint_values(info["state"]).max() > 0.0
-        assert info["cost"] == float(beyond or outside)
-        assert len(info["constraint_values"]) == len(plant.box)
-        counted += beyond and not outside
-    assert counted > 5
-
-
 @pytest.mark.cases(2)
 @pytest.mark.parametrize("name", MIXED)
 def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name):
@@ -85,15 +65,6 @@ def test_closer_limits_and_changed_multipliers_are_refused_by_both_engines(name)
     forged += [(claimed, closer), (replace(found, safe_set=few), plant)]
     for each, claims in forged:
         assert not verified(each, claims).valid
-
-
-def test_limit_of_a_late_input_is_one_of_the_input_that_acts():
-    limit = [([-0.5, -1.0], [1.0], -0.6, 0.4)]
-    plant = sampled_plant(MODEL, 0.1, input_delay=2, mixed_limits=limit, **ONE_INPUT, **QUIET)
-    assert not len(plant.mixed_rows)
-    state = np.array([0.1, 0.2, 0.35, -0.4])  # the oldest input acts now
-    value = -0.05 - 0.2 + 0.35
-    assert plant.constraint_values(state)[-1] == pytest.approx(max(value - 0.4, -0.6 - value) / 0.5)
 
 
 @pytest.mark.cases(1)
@@ -129,12 +100,6 @@ def test_proposal_beyond_the_rate_becomes_the_closest_one_that_keeps_it(name):
         assert decision.input == pytest.approx(0.3 * np.sign(proposed), abs=1e-3)
 
 
-def test_plant_with_such_limits_has_none_that_are_only_symmetric():
-    for name in ("u_max", "box_rows"):
-        with pytest.raises(ValueError, match="this needs limits"):
-            getattr(PLANTS["coupled"], name)
-
-
 def test_only_a_polytope_is_sought_and_a_limit_that_nothing_keeps_has_a_reason():
     with pytest.raises(ValueError, match="only a polytope is sought"):
         synthesize(PLANTS["coupled"], safe_set="ellipsoid")
@@ -155,11 +120,3 @@ def test_limits_count_beside_times_between_samples():
     names = [condition.name[:4] for condition in verify(found, plant).conditions]
     assert names.count("(PM)") == 1
     assert names.count("(PB)") == 4 * len(plant.box)
-    env = gym_env(plant=plant, channel=CHANNEL, contract=CONTRACT, disturbance="adversarial")
-    shield, rng = safety_shield(env, found), np.random.default_rng(0)
-    shield.reset(seed=0)
-    for _ in range(100):
-        _, _, _, _, info = shield.step(rng.choice([-1.0, 1.0], 1).astype(np.float32))
-        assert info["shield_guaranteed"]
-        assert info["cost"] == 0.0
-        assert len(info["worst_constraint_values"]) == len(plant.box) + 1

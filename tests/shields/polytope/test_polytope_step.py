@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from ncs_gym import ChannelContract, Ellipsoid
+from ncs_gym import Ellipsoid
 from shields.runtime.projection import closest_between
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.starts import starts_inside
 from tests.certificates import certificate_of
-from tests.product import linear_plant, safety_filter
+from tests.product import safety_filter
 from tests.shields.runtime.batches import decided_alike
 
 ALL = ("TruckTrailerCruise", "CartPole", "BatchReactor", "Pendulum", "CartPoleTwoWay")
@@ -48,18 +48,6 @@ def test_closest_points_do_not_depend_on_units_and_bear_many_rows(unit):
         normals = effect[active] * np.sign(values[active, k])[:, None]
         assert active.any()
         assert nnls(normals.T, (wanted - found)[:, k])[1] < 1e-6
-
-
-def test_parallel_rows_do_not_hide_the_closest_point():
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        row = rng.standard_normal(2)
-        effect = np.stack([row, rng.uniform(0.1, 3.0) * row, [1.0, 0.0], [0.0, 1.0]])
-        room = np.array([1.0, np.linalg.norm(effect[1]) / np.linalg.norm(row), 5.0, 5.0])
-        wanted = 3.0 * rng.standard_normal((2, 1))
-        found = closest_between(wanted, np.zeros((4, 1)), effect, room[:, None])[:, 0]
-        once = closest_between(wanted, np.zeros((3, 1)), effect[[0, 2, 3]], room[[0, 2, 3], None])[:, 0]
-        np.testing.assert_allclose(found, once, atol=1e-9)
 
 
 @pytest.mark.cases(5)
@@ -108,13 +96,3 @@ def test_starts_are_decided_exactly():
     inside = wide_certificate("BatchReactor", "ellipsoid")[0].safe_set
     assert starts_inside(certificate, inside)
     assert not starts_inside(certificate, Ellipsoid(4.0 * inside.shape_matrix))
-
-
-def test_polytope_of_a_plant_with_one_state_is_an_interval():
-    plant = linear_plant(
-        A=[[1.05]], B=[[0.5]], box=[1.0], u_max=1.0, dt=0.1, gamma=1e-4,
-        measurement_noise_cov=[[1e-6]], initial_cov=[[1e-6]],
-    )  # fmt: skip
-    certificate = certificate_of(plant, ChannelContract(2), "polytope")
-    np.testing.assert_array_equal(certificate.safe_set.rows[0], plant.box_rows[0])
-    assert safety_filter(certificate, plant).decide(np.zeros(1), certificate.Sigma, np.zeros(1)).reason == "safe"

@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from benchmarks.published import channel_of, contract_of_plant, plant_of, published
-from ncs_gym import ChannelContract, Ellipsoid, contract_of
+from ncs_gym import ChannelContract, Ellipsoid
 from ncs_gym.limits import MovedOperatingPointWarning
 from shields import CertificateError, Infeasible
-from shields.synthesis.resting_point import farthest_equilibrium, improved
-from shields.synthesis.tolerance import most_tolerated
 from tests.certificates import certificate_of
 from tests.product import altered, linear_plant, loop_env, safety_shield, synthesize
 from tests.shields.polytope.limits import ANGLE, ASYMMETRIC, CONTRACT, PLANTS, QUIET, certificate
@@ -45,6 +42,22 @@ def test_limit_with_one_end_alone_is_kept():
     assert found.safe_set.high[0] == np.inf
     reached = found.safe_set.rows[1:] @ np.array([1e6])
     assert ((reached > found.safe_set.high[1:]) | (reached < found.safe_set.low[1:])).any()
+
+
+def test_state_without_a_limit_is_bounded_by_what_the_others_allow():
+    model = {"A": [[1.0, 0.1], [0.0, 0.95]], "B": [[0.0], [0.1]], "dt": 0.1, "u_max": 1.0} | QUIET
+    plant = linear_plant(**model, state_limits=([-1.0, -np.inf], [2.0, np.inf]), disturbance_bound=[0.001, 0.01])
+    found = certificate_of(plant, ChannelContract(max_age=2), "polytope")
+    assert verified(found, plant).valid
+    assert np.isfinite(found.safe_set.widths).all()
+
+
+def test_disturbance_around_which_nothing_rests_is_refused():
+    settings = {"A": [[0.9]], "B": [[0.0]], "dt": 1.0, "box": 1.0, "u_max": 1.0} | QUIET
+    with pytest.raises(ValueError, match="no state stays where it is"):
+        linear_plant(**settings | {"A": [[1.0]]}, disturbance_bound=([[1.0]], [0.0], [0.1]))
+    with pytest.raises(ValueError, match="not strictly within the limits"):
+        linear_plant(**settings, disturbance_bound=([[1.0]], [0.0], [0.9]))
 
 
 def test_an_input_may_rest_at_an_end_and_a_state_may_not():
@@ -185,48 +198,6 @@ def test_bound_of_a_disturbance_with_two_ends_holds_all_of_it_in_rational_number
     np.testing.assert_allclose(plant.input_ends + u, absolute.input_ends, atol=1e-12)
 
 
-def test_disturbance_with_symmetric_ends_leaves_the_operating_point():
-    settings = {"A": [[0.9]], "B": [[0.2]], "dt": 1.0, "box": 1.0, "u_max": 1.0} | QUIET
-    both = linear_plant(**settings, disturbance_bound=([[1.0]], [-0.1], [0.1]))
-    assert both.fingerprint == linear_plant(**settings, disturbance_bound=([[1.0]], 0.1)).fingerprint
-    of_two = linear_plant(**settings, disturbance_bound=([[1.0, 5.0]], [-0.1, 0.0], [0.1, 0.0]))
-    assert of_two.fingerprint == both.fingerprint, "what is always 0 adds nothing"
-    with pytest.raises(ValueError, match="low <= high"):
-        linear_plant(**settings, disturbance_bound=([[1.0]], [0.1], [-0.1]))
-    with pytest.raises(ValueError, match="no state stays where it is"):
-        linear_plant(**settings | {"A": [[1.0]], "B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.1]))
-    with pytest.raises(ValueError, match="not strictly within the limits"):
-        linear_plant(**settings | {"B": [[0.0]]}, disturbance_bound=([[1.0]], [0.0], [0.9]))
-
-
-def test_state_without_a_limit_is_bounded_by_what_the_others_allow():
-    plant = linear_plant(
-        A=[[1.0, 0.1], [0.0, 0.95]],
-        B=[[0.0], [0.1]],
-        dt=0.1,
-        state_limits=([-1.0, -np.inf], [2.0, np.inf]),
-        u_max=1.0,
-        disturbance_bound=[0.001, 0.01],
-        **QUIET,
-    )
-    found = certificate_of(plant, ChannelContract(max_age=2), "polytope")
-    assert verified(found, plant).valid
-    assert np.isfinite(found.safe_set.widths).all()
-
-
-@pytest.mark.parametrize("name", published())
-def test_published_plant_is_accepted_as_its_authors_write_it(name):
-    plant, p = plant_of(name), published()[name]
-    published_ends = np.array([p["input_low"], p["input_high"]])
-    np.testing.assert_allclose(plant.input_ends + plant.operating_input, published_ends, rtol=1e-9, atol=1e-9)
-    limited = [i for i in range(len(p["state_low"])) if p["state_low"][i] is not None or p["state_high"][i] is not None]
-    for j, i in enumerate(limited):
-        low, high = plant.box_ends[:, j] / plant.box[j, i] + plant.operating_state[i]
-        for end, given in ((low, p["state_low"][i]), (high, p["state_high"][i])):
-            assert end == pytest.approx(given, abs=1e-9) if given is not None else np.isinf(end)
-    assert contract_of(channel_of(name)).max_age <= contract_of_plant(name).max_age
-
-
 @pytest.mark.parametrize("name", ASYMMETRIC)
 def test_first_rows_of_a_polytope_have_the_ends_of_the_box(name):
     """A plan ends in the polytope if it passes the box's own ends in these rows: closer ones would not be tested."""
@@ -239,25 +210,6 @@ def test_first_rows_of_a_polytope_have_the_ends_of_the_box(name):
         assert "polytope: its first rows are those of the safe box" in broken(forged, plant)
 
 
-def test_what_an_offset_lacks_of_an_equilibrium_by_rounding_is_in_the_bound():
-    state, A, B = 101325.0, 0.5, 0.25
-    offset = (1.0 - A) * state * (1.0 + 5e-13)
-    plant = linear_plant(
-        A=[[A]],
-        B=[[B]],
-        dt=1.0,
-        state_limits=(state - 1e-3, state + 2e-3),
-        input_limits=(-1.0, 1.0),
-        operating_state=state,
-        offset=[offset],
-        disturbance_bound=0.0,
-        **QUIET,
-    )
-    residual = Fraction(A) * Fraction(state) + Fraction(offset) - Fraction(state)
-    assert residual > 1e-9
-    assert Fraction(float(plant.disturbance.shape_matrix[0, 0])) >= residual**2
-
-
 def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monkeypatch):
     def failing(*arguments):
         raise np.linalg.LinAlgError("Matrix is not positive definite")
@@ -266,17 +218,3 @@ def test_what_a_library_says_of_numbers_is_told_as_their_being_out_of_reach(monk
     said = r"out of reach of float64 \(Matrix is not positive definite\): give states units"
     with pytest.raises(Infeasible, match=said):
         synthesize(ANGLE, contract=CONTRACT)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["port_crane", "propofol"])
-def test_plant_that_bears_little_more_than_its_radii_has_a_polytope(name):
-    plant, contract = plant_of(name), contract_of_plant(name)
-    assert most_tolerated(plant, contract, polytope=True).margin < 1.02
-    assert verified(synthesize(plant, contract=contract), plant).valid
-
-
-def test_better_resting_point_is_an_equilibrium_nearer_to_the_best_one():
-    rest = improved(ANGLE, farthest_equilibrium(ANGLE).rest, lambda rest: -abs(rest.state[0] - 0.3))
-    assert rest.state[0] == pytest.approx(0.3, abs=0.02)
-    np.testing.assert_allclose(ANGLE.A @ rest.state + ANGLE.B @ rest.input, rest.state, atol=1e-9)

@@ -42,10 +42,3 @@ def test_an_intervention_shows_in_its_frame_and_in_no_other(certificate):
         assert tinted == info["shield_intervened"]
         seen.add(tinted)
     assert seen == {True, False}
-
-
-def test_a_shield_that_is_not_drawn_tells_nothing(certificate, monkeypatch):
-    env = shielded(certificate, render_mode=None)
-    monkeypatch.setattr("ncs_gym.envs.env.note_of", None)
-    env.step(FULL_THROTTLE)
-    assert env.unwrapped.renderer is None

@@ -12,7 +12,7 @@ from shields.runtime.guard import Guard
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.set_test import ellipsoid_test
 from tests.certificates import certificate_of
-from tests.product import altered, loop_env, safe_loop, safety_shield, vector_env, vector_shield
+from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 MODES = ["project", "lookahead"]
@@ -131,12 +131,3 @@ def test_solver_that_does_not_come_to_its_end_has_no_answer_and_is_not_asked_aga
     np.testing.assert_array_equal(program.solve(*DATA), answer)
     with pytest.raises(ValueError, match="shape"):  # no failure of the solver
         program.solve(DATA[0], DATA[1][:3], *DATA[2:])
-
-
-def test_plans_of_inputs_with_uneven_ends_begin_with_what_is_proposed_or_its_end():
-    plant = altered(PLANT, input_limits=([-1.0], [4.0]))
-    program = PlanProgram(Prediction(ellipsoid_test(certificate_of(PLANT).safe_set.shape_matrix, plant), 4))
-    for proposed, closest in ((3.0, 3.0), (9.0, 4.0), (-9.0, -1.0)):
-        plan = program.solve(*DATA[:-1], np.array([proposed]))
-        np.testing.assert_allclose(plan[0], closest, atol=1e-4)
-        assert ((plan >= -1.0 - 1e-6) & (plan <= 4.0 + 1e-6)).all()

@@ -80,12 +80,6 @@ def test_shield_raises_when_the_step_has_been_taken_and_goes_on(shielded):
     shield.step(still(shield))
 
 
-@pytest.mark.parametrize("shielded", [scalar, vector])
-def test_shield_that_is_told_so_says_nothing(shielded):
-    shield = shielded(on_unproved="ignore")
-    assert said(lambda: (lose(shield), shield.step(still(shield)))) == []
-
-
 def test_one_environment_of_many_is_enough_and_says_it_in_its_own_episode():
     shield = vector()
     states = np.zeros((3, PLANT.n))

@@ -135,11 +135,12 @@ def test_wild_stamps_and_inputs_do_not_stop_an_actuator(input_delay):
     assert len(pickle.dumps(actuator)) < 2 * size
 
 
-def test_command_that_comes_early_is_kept_for_its_step():
-    actuator = Actuator(1, 1)
-    actuator.receive([Command(0, np.array([[0.0], [1.0]])), Command(1, np.array([[1.0], [2.0]]))])
-    assert [actuator.apply(step).tolist() for step in range(4)] == [[0.0], [1.0], [2.0], [0.0]]
-    assert (actuator.missing, actuator.echo.missing) == (True, 1)
+def test_actuator_takes_commands_of_its_episode_alone_and_repeats_nothing():
+    actuator = Actuator(2, 1)
+    actuator.start(episode=1)
+    actuator.receive([Command(2, np.full((3, 1), 9.0), 0), Command(2, np.ones((3, 1)), 1)])  # of steps 2, 3 and 4
+    assert [actuator.apply(step).item() for step in range(6)] == [0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
+    assert actuator.missing
 
 
 def test_actuator_whose_clock_goes_back_says_that_it_applied_something_else():

@@ -93,12 +93,9 @@ THIRTEEN = small([[0.9, 0.1], [0.0, 0.8]], B=np.ones((2, 13)))
 REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # Shields: what they wrap.
     (lambda: SafetyShield(scalar(CERTIFICATE), CERTIFICATE), ValueError, ALREADY),
-    (lambda: SafetyShield(scalar(CERTIFICATE).unwrapped, CERTIFICATE), ValueError, ALREADY),
     (lambda: VectorSafetyShield(vector(CERTIFICATE), CERTIFICATE), ValueError, ALREADY),
     (lambda: SafetyShield(SYNC, CERTIFICATE), ValueError, "needs an NCSEnv inside"),
-    (lambda: SafetyShield(NCSVectorEnv(2, plant=PLANT), CERTIFICATE), ValueError, "needs an NCSEnv inside"),
     (lambda: VectorSafetyShield(SYNC, CERTIFICATE), ValueError, "needs an NCSVectorEnv inside"),
-    (lambda: VectorSafetyShield(gym.make(CRUISE), CERTIFICATE), ValueError, "needs an NCSVectorEnv inside"),
     (lambda: SafetyShield(gym.make("Pendulum-v1")), ValueError, NO_MODEL),
     # Shields: their settings.
     *[
@@ -107,8 +104,7 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         for name, value, words in (
             ("mode", "off", "mode must be"),
             ("penalty", -1.0, "penalty must be"),
-            ("penalty", np.nan, "penalty must be"),
-            *(("on_unproved", wrong, UNPROVED) for wrong in ("log", None, ["warn"])),
+            ("on_unproved", "log", UNPROVED),
         )
     ],
     *[
@@ -135,30 +131,16 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
         for shield in SHIELDS
         for value in (np.nan, np.inf)
     ],
-    # Environments.
     (lambda: LoopConfig(env="ncs_gym/CartPol-v0"), ValueError, "is no registered environment"),
-    (lambda: LoopConfig(env="CSTR-v0"), ValueError, "is no registered environment"),
-    (lambda: LoopConfig(env="ncs_gym/Nothing-v0"), ValueError, "'ncs_gym/Nothing-v0' is no registered environment"),
     # Filters.
     (
         lambda: SafetyFilter(replace(CERTIFICATE, safe_set=Ellipsoid(1.1 * CERTIFICATE.safe_set.shape_matrix)), PLANT),
         CertificateError,
         r"\(S\)",
     ),
-    (lambda: SafetyFilter(CERTIFICATE, OTHER), CertificateError, "another plant"),
-    *[
-        (partial(SafetyFilter, *given), ValueError, "a shield takes a Certificate")
-        for given in ((PLANT, CERTIFICATE), (CERTIFICATE, "plant"), ("certificate", PLANT))
-    ],
-    (lambda: SafetyFilter(CERTIFICATE, PLANT, "hope"), ValueError, "mode must be one of"),
-    *[
-        (partial(SafetyFilter, CERTIFICATE, PLANT, mode, 3), ValueError, 'horizon is for mode "lookahead"')
-        for mode in ("project", "switch", "boundary", "monitor")
-    ],
-    *[
-        (partial(SafetyFilter, CERTIFICATE, PLANT, "lookahead", wrong), ValueError, "horizon")
-        for wrong in (0, -1, 51, 2.5, "3", True, np.nan)
-    ],
+    (lambda: SafetyFilter(PLANT, CERTIFICATE), ValueError, "a shield takes a Certificate"),
+    (lambda: SafetyFilter(CERTIFICATE, PLANT, "project", 3), ValueError, 'horizon is for mode "lookahead"'),
+    *[(partial(SafetyFilter, CERTIFICATE, PLANT, "lookahead", wrong), ValueError, "horizon") for wrong in (0, 51, 2.5)],
     (lambda: SafetyFilter(CERTIFICATE, THIRTEEN, "boundary"), ValueError, "at most 12 inputs, got 13"),
     *[
         (partial(lambda *given: safety_filter().decide_many(*given), *given), ValueError, "must be numbers of shape")
@@ -170,18 +152,13 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     # Loops: their settings, and calls before an episode has begun.
     (lambda: SafeLoop(OF_CART, CART, CONTRACT), ValueError, "channel must be a Channel"),
     (lambda: SafeLoop(OF_CART, CART, Channel(quantization_step=0.1)), ValueError, "rounds more coarsely"),
-    (lambda: SafeLoop(OF_CART, OTHER, Channel()), CertificateError, "another plant"),
-    (lambda: SafeLoop(OF_CART, CART, Channel(), "hope"), ValueError, "mode must be"),
-    *[(partial(loop_of, on_unproved=wrong), ValueError, UNPROVED) for wrong in ("log", None, ["warn"])],
+    (lambda: loop_of(on_unproved="log"), ValueError, UNPROVED),
     (lambda: loop_of().receive(), RuntimeError, "call start"),
     (lambda: loop_of().decide(0.0), RuntimeError, "call start"),
     (lambda: loop_of().step(0.0), RuntimeError, "call start"),
     (lambda: Estimator(CART, KEPT), UnstablePlantError, r"error_set=certified_error_set\(plant, contract\)"),
     # What stands at the other end.
-    *[
-        (partial(Actuator, 1, 1, u_max), ValueError, "u_max must be a size")
-        for u_max in (-1.0, [1.0, 2.0], "10", np.nan)
-    ],
+    (lambda: Actuator(1, 1, -1.0), ValueError, "u_max must be a size"),
     (
         lambda: Actuator(1, 1).receive([Command(0, np.zeros((2, 1)), 0, (True,))]),
         ValueError,
@@ -215,14 +192,13 @@ OF_LOOP: list[tuple[bool, Callable[[SafeLoop], Any], type[Exception], str]] = [
         (True, partial(lambda given, loop: loop.receive(echoes=[given]), given), ValueError, NO_ECHO)
         for given in (None, 5, ("1", 0, b"", 0), (1, 0, "", 0), (1, 0))
     ],
+    (True, lambda loop: loop.receive(echoes=[(1, 0, b"", 0)]), ValueError, "echo_age"),
     (False, lambda loop: loop.receive(), RuntimeError, "receive was called twice"),
     (True, lambda loop: loop.decide(0.0), RuntimeError, "decide was called twice"),
     (False, lambda loop: loop.command(), RuntimeError, "call decide before command"),
     (False, lambda loop: loop.decide(0.0, ask=True), ValueError, "on_request=True"),
     (True, lambda loop: loop.request, ValueError, "on_request=True"),
     (False, lambda loop: loop.start([0.0]), ValueError, r"x_hat0 = \(.*, .*\) must have shape"),
-    (True, lambda loop: loop.start([np.nan, 0.0]), ValueError, r"x_hat0 = \(.*\) must be finite"),
-    (False, lambda loop: loop.start(TWO, [1.0]), ValueError, "initial_set must have shape"),
     (True, lambda loop: loop.start(TWO, Ellipsoid(np.eye(3))), ValueError, "initial_set must have dimension 2"),
 ]
 

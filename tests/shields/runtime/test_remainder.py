@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess
+from ncs_gym import Channel, Ellipsoid, FunctionProcess
 from ncs_gym.plants.family import Remainder
 from shields import Infeasible
 from shields.runtime.guarantee import EXPLANATIONS, LEFT_MODEL, NOT_KNOWN_INSIDE
@@ -51,11 +51,6 @@ def reasons(plant, start, mode="monitor", **settings):
     return [*seen, info["shield_reason"]]
 
 
-def test_both_plants_have_the_same_bounds_but_not_the_same_name():
-    np.testing.assert_array_equal(EXACT.disturbance.shape_matrix, LOCAL.disturbance.shape_matrix)
-    assert EXACT.fingerprint != LOCAL.fingerprint
-
-
 DOWNLINK = {"downlink": Channel(loss=0.3, delay=2, max_consecutive_losses=1)}
 
 
@@ -88,13 +83,6 @@ def test_certificate_says_what_it_assumes_of_the_remainder():
     assert "remainder" not in str(certificate_of(EXACT))
 
 
-def test_remainder_acts_on_the_state_alone_where_inputs_are_under_way():
-    plant = late(2)
-    np.testing.assert_array_equal(plant.remainder_bound.shape_matrix, np.pad(BOUND.shape_matrix, (0, 2)))
-    np.testing.assert_allclose(plant.disturbance.shape_matrix[:2, :2], BOUND.shape_matrix, rtol=1e-6)
-    assert plant.remainder.sentence == LEFT_OUT.sentence
-
-
 @pytest.mark.cases(1)
 @pytest.mark.parametrize("downlink", [{}, {"downlink": Channel(delay=1)}])
 def test_inputs_under_way_beyond_their_limits_are_outside_the_model(downlink):
@@ -114,23 +102,6 @@ def test_inputs_under_way_that_an_error_may_put_beyond_their_limits_are_outside_
         for last in (0.99, -0.99):
             state = GuaranteeMonitor(shield).start(True, belief(np.array([0.0, 0.0, last])), errors)
             assert EXPLANATIONS[state.broken] == reason
-
-
-@pytest.mark.slow
-def test_remainder_that_the_box_cannot_bear_is_named():
-    plant = linear_plant(
-        A=[[1.2]],
-        B=[[1.0]],
-        box=[1.0],
-        u_max=0.3,
-        dt=0.1,
-        disturbance_bound=0.0,
-        sensor_bound=0.001,
-        initial_bound=0.001,
-        remainder=Remainder(Ellipsoid([[0.25]]), True, "an example"),
-    )
-    with pytest.raises(Infeasible, match=r"times the given remainder or less \(shrink the box"):
-        synthesize(plant, contract=ChannelContract(0))
 
 
 def test_family_that_the_box_cannot_bear_is_told_what_share_of_its_radii_would_do():

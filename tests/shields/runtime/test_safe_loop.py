@@ -1,9 +1,11 @@
 """The loop without Gymnasium: the same decisions and proofs as the wrapper's."""
 
+import copy
 from contextlib import nullcontext
 
 import numpy as np
 import pytest
+import torch
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truck_trailer
 from ncs_gym.network.channel import UnusedPacketsWarning
@@ -49,18 +51,6 @@ def test_another_input_than_decided_is_told_or_found_out(told):
             assert e @ np.linalg.solve(loop.error_shape, e) <= 1.0
     assert set(reasons[-20:]) == {OTHER_INPUT if told else ALARM}
     assert (reasons[0] == OTHER_INPUT) is told
-
-
-def test_another_input_than_decided_is_not_seen_without_packets():
-    # The documented limitation: nothing that the loop is given says so.
-    loop, x, level = started(channel=Channel()), np.zeros(2), 0.0
-    for _ in range(60):
-        loop.decide(0.3 * loop.filter.plant.u_max)
-        x = pushed(loop.filter.plant, x, loop.filter.plant.u_max, np.ones(2))
-        loop.receive()
-        level = max(level, loop.filter.certificate.safe_set.gauge(x))
-    assert level > 1.0
-    assert loop.guaranteed
 
 
 @pytest.mark.parametrize(("held", "passes"), [(0.1, True), (4.0, False)])
@@ -184,3 +174,33 @@ def test_sample_that_is_sent_after_a_decision_and_received_at_the_next_step_is_o
             arrived = [Packet(step, np.zeros(2), loop.episode)]
     assert loop.discarded.too_late == late
     assert loop.measurement_age == (20 if late else 1)
+
+
+@pytest.mark.filterwarnings("error")
+def test_proposals_that_are_no_input_are_told_of_once_and_not_applied():
+    gradient = torch.tensor([0.5], requires_grad=True)
+    for proposed in (gradient, [gradient[0]], np.full((1, 1), 0.5), "full throttle", np.nan, np.array([np.inf])):
+        loop = started(channel=Channel())
+        assert loop.step(None).reason == "invalid"  # a controller that failed is no mistake
+        with pytest.warns(UserWarning, match=r"one input, finite numbers of shape \(1,\), got .*K x_hat is applied"):
+            decision = loop.step(proposed)
+        assert decision.reason == "invalid"
+        np.testing.assert_allclose(decision.input, loop.filter.certificate.K @ loop.estimate, atol=1e-6)
+        loop.step(proposed)
+
+
+def test_copy_of_a_loop_shares_nothing_with_it():
+    """A shallow copy that shared the estimator would go on with what the other was told, and be guaranteed outside."""
+    loop, x = started(channel=Channel(delay=1)), np.zeros(2)
+    plant = loop.filter.plant
+    for k in range(30):
+        loop.receive([Packet(k, x, loop.episode)] if k else [])
+        x = plant.A @ x + plant.B @ loop.decide([4.0]).input
+    trial, own = copy.copy(loop), copy.deepcopy(loop)
+    for _ in range(50):
+        trial.receive()
+        trial.decide([-4.0])
+        loop.receive()
+        own.receive()
+        np.testing.assert_array_equal(loop.decide([4.0]).input, own.decide([4.0]).input)
+        assert loop.guaranteed == own.guaranteed

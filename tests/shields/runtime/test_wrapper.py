@@ -6,12 +6,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from ncs_gym import AdversarialDisturbance, Ellipsoid
 from shields import SafetyShield
 from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
 )
-from tests.certificates import metric
 from tests.product import safety_shield
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
@@ -105,24 +103,3 @@ def test_monitor_is_the_unshielded_environment_bit_for_bit(certificate):
         doubted |= info["shield_reason"] == NOT_KNOWN_INSIDE
     assert 10 < counted < 150
     assert doubted
-
-
-def test_monitor_keeps_the_proof_while_nothing_unsafe_is_proposed(certificate):
-    env = shielded(
-        certificate,
-        mode="monitor",
-        disturbance=AdversarialDisturbance(metric(certificate)),
-    )
-    gain = certificate.K / env.filter.plant.u_max[:, None]
-    infos = play(env, lambda info: gain @ info["estimate"], seed=0)
-    assert all(info["shield_guaranteed"] for info in infos)
-    assert infos[-1]["episode_interventions"] == 0
-
-
-# The proof and its assumptions, each broken on purpose.
-
-
-def test_initial_set_that_leaves_the_safe_set_is_not_trusted(certificate):
-    env = shielded(certificate, initial_set=Ellipsoid(4.5 * np.eye(2)))
-    reasons = {env.reset(seed=seed)[1]["shield_reason"] for seed in range(40)}
-    assert reasons == {"", NOT_KNOWN_INSIDE}

@@ -41,10 +41,3 @@ def test_first_call_is_accepted_or_refused_with_what_helps(name):
     assert time.thread_time() - began < LONGEST
     if name not in REFUSED:
         assert verified(found, plant).valid
-
-
-def test_operating_point_that_was_not_given_is_asked_for():
-    given = CALLS["zone_22"]
-    arguments = {name: value for name, value in given["arguments"].items() if not name.startswith("operating")}
-    with pytest.raises(ValueError, match=r"the operating point, at=\(state, input\)"):
-        sampled_plant(tuple(given["model"]), given["dt"], **arguments)

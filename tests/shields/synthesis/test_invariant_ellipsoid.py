@@ -7,36 +7,10 @@ from ncs_gym.plants.library import batch_reactor
 from ncs_gym.plants.lqr import regulator_gain
 from shields import Infeasible
 from shields.synthesis.design_problem import design_problem
-from shields.synthesis.tolerance import invariant_ellipsoid, most_tolerated, regulators
-from tests.plants import random_plant
-from tests.product import altered, library_plant, linear_plant, synthesize
-from tests.verdicts import verified
+from shields.synthesis.tolerance import invariant_ellipsoid, regulators
+from tests.product import library_plant, linear_plant, synthesize
 
 CONTRACT = ChannelContract(2, 1e-4)
-
-
-def slow(*values):
-    """More of the same, for the slow tests."""
-    return pytest.param(*values, marks=pytest.mark.slow)
-
-
-def radii_scaled(plant, factor):
-    """The plant with the radii of all its uncertainty scaled."""
-    plant = altered(plant, gamma=factor**2 * plant.gamma)
-    covariances = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
-    return altered(plant, **{name: factor**2 * getattr(plant, name) for name in covariances})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", [lambda: random_plant(3, 2, 1), *map(slow, (batch_reactor, cart_pole))])
-def test_its_margin_is_what_exact_verification_accepts(make):
-    plant, contract = make(), ChannelContract(2)
-    margin = most_tolerated(plant, contract, polytope=False).margin
-    tolerated = radii_scaled(plant, 0.99 * margin)
-    assert verified(synthesize(tolerated, contract=contract, safe_set="ellipsoid"), tolerated).valid
-    with pytest.raises(Infeasible, match="radii shrink to") as caught:
-        synthesize(radii_scaled(plant, 2.0 * margin), contract=contract, safe_set="ellipsoid")
-    assert caught.value.shortfall == pytest.approx(0.5, rel=1e-2)
 
 
 def test_its_set_is_the_smallest_that_is_invariant_with_its_gain():

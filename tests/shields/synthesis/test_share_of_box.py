@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, truck_trailer
-from shields import verify
 from shields.certificate_text import size_of
 from shields.synthesis.certificate_fields import reach_recorded, share_of_box
 from tests.certificates import certificate_of
@@ -28,25 +27,6 @@ def test_box_with_more_rows_than_states_has_no_share_and_the_reach_is_said_inste
     assert record["reach"][6].startswith("12.25 % of |x1 + x2 + ")
     assert size_of(record) == f"up to {', '.join(record['reach'])}"
     assert size_of({"reach": ["1 %", 2.0], "share_of_box": "none"}) == "up to 1 %"
-
-
-@pytest.mark.cases(1)
-@pytest.mark.parametrize(
-    "rows", [[[1, 0], [1, 0]], [[1, 0], [2, 0]], [[1, -1], [2, -2], [3, -3]], [[1, 0], [2, 0], [3, 0]]]
-)
-def test_parallel_rows_bound_nothing_in_the_other_direction(rows):
-    settings = {"A": [[0.9, 0.1], [0.0, 0.8]], "B": [[0.0], [0.1]], "dt": 1.0, "u_max": 1.0}
-    plant = linear_plant(**settings, box=rows, disturbance_bound=0.001, sensor_bound=0.001, initial_bound=0.001)
-    certificate = synthesize(plant)
-    assert verify(certificate, plant).valid
-    assert "size up to " in " ".join(str(certificate).split())
-    assert " % of |" in size_of(certificate.provenance)
-    assert "share_of_box" not in certificate.provenance
-
-
-def test_unbounded_box_has_no_share():
-    plant = altered(truck_trailer(), box=np.array([[0.5, 0.0]]))
-    assert share_of_box(plant, np.diag([1.0, 5.0])) == {}
 
 
 def test_share_of_a_polytope_is_of_what_further_limits_leave_of_the_box():

@@ -49,18 +49,6 @@ def test_any_other_last_digit_makes_another_certificate(certificate, by_age):
     assert replace(certificate, fingerprint="0" * 64) != certificate
 
 
-def test_printed_certificate_says_what_it_is_for(certificate, by_age):
-    text = " ".join(str(certificate).split())
-    assert "fallback" in text
-    assert "2 states, 1 input" in text
-    # A plane's largest ellipse fills pi/4 of its parallelogram.
-    volume = np.sqrt(np.linalg.det(certificate.safe_set.shape_matrix)) * np.pi / 16.0  # the box is 4 by 4
-    assert f"{100.0 * volume:.4g} % of the safe box's volume" in text
-    assert "99.97 % of the largest ellipsoid" in text
-    assert "none: any packets may be lost or late" in text
-    assert "never older than 1 step; samples are rounded to 0.001 or finer" in " ".join(str(by_age).split())
-
-
 def test_tolerated_scale_is_one_that_some_certificate_exists_for(loaded, certificate):
     scale = certificate.provenance["tolerated_scale"]
     assert f"up to {scale:.2f} times those assumed" in " ".join(str(certificate).split())

@@ -10,7 +10,7 @@ from flint import fmpq, fmpq_mat
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ncs_gym import Ellipsoid, truck_trailer
+from ncs_gym import truck_trailer
 from ncs_gym.uncertainty.ellipsoid import TruncatedGaussian, truncation_energy
 from shields import verify
 from shields.verification.rational_matrix import is_positive_semidefinite, rational
@@ -102,16 +102,6 @@ def test_a_slip_in_one_verifier_is_noticed_by_the_other(slip, certificate, loade
     monkeypatch.setattr(slip, lambda *args, **settings: True)
     with pytest.raises(AssertionError):
         verified(wrong, loaded)
-
-
-def test_large_limits_and_small_multipliers_are_judged_alike():
-    plant = truck_trailer(mass=4000.0)
-    certificate = certificate_of(plant)
-    for rounding in (1e-30, 1e-9, 1e-3, 1e3, 5e-324):
-        verified(with_multipliers(certificate, rounding=rounding), plant)
-    for factor in (1e-300, 1e-30, 1e30, 1e70):
-        verified(replace(certificate, safe_set=Ellipsoid(factor * certificate.safe_set.shape_matrix)), plant)
-        verified(replace(certificate, K=factor * certificate.K), plant)
 
 
 @pytest.mark.parametrize("delta", [1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 1e-3, 0.05, 0.5, 0.999])
