@@ -16,6 +16,7 @@ from ncs_gym.processes.plant_step import PlantSimulation
 from shields import Certificate, SafetyShield
 from shields.runtime.guarantee import OUTSIDE_BOUND
 from tests import arrays
+from tests.certificates import metric
 from tests.product import safe_loop, safety_shield, vector_shield
 
 
@@ -265,7 +266,7 @@ def compare(
     # Without a shield that keeps it there, nothing may drive an unstable plant out of its box.
     held = gain.any() and (not shielded or mode == "monitor")
     over = np.zeros(many.num_envs, np.bool_)
-    push = many.plant.weight @ many.plant.A
+    push = many.plant.weight @ many.plant.A if certificate is None else metric(certificate) @ many.plant.A
     rtol, atol = (1e-5, 1e-7) if shielded else (1e-10, 1e-10)  # where actions are rounded to float32, or not
 
     def begin(index: int, infos: dict[str, Any]) -> None:

@@ -6,7 +6,6 @@ import pytest
 
 from ncs_gym import BrokenContractWarning, Channel, ChannelContract, RandomChannel, VectorRandomChannel, cart_pole
 from shields import GuaranteeLostWarning
-from tests import product
 from tests.certificates import certificate_of
 from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 
@@ -39,7 +38,7 @@ def many_shields(channel, downlink):
 def test_channel_that_breaks_the_contract_without_any_loss_is_pointed_out(make, channel, downlink, words):
     with pytest.warns(BrokenContractWarning, match=words) as caught:
         make(channel, downlink)
-    assert [each.filename for each in caught] == [product.__file__]
+    assert [each.filename for each in caught] == [__file__]
 
 
 def test_rounding_that_the_contract_does_not_allow_is_pointed_out():
@@ -68,7 +67,7 @@ def test_channel_that_may_keep_the_contract_is_taken_without_a_warning(make, cha
 def test_real_loop_points_out_losses_that_break_the_contract(channel, words):
     with pytest.warns(BrokenContractWarning, match=words) as caught:
         loop(channel, None)
-    assert [each.filename for each in caught] == [product.__file__]
+    assert [each.filename for each in caught] == [__file__]
 
 
 @pytest.mark.parametrize("make", [shield, many_shields])
