@@ -172,7 +172,7 @@ class Certificate(ReadOnlyArrays):
     def _check_fields(self) -> None:
         if not (isinstance(self.provenance, dict) and isinstance(self.fingerprint, str)):
             raise ValueError("its provenance must be a dict, and its fingerprint a text")
-        if not isinstance(self.safe_set, Ellipsoid | Polytope):
+        if type(self.safe_set) not in (Ellipsoid, Polytope):
             raise ValueError("its safe set must be an Ellipsoid or a Polytope")
         for name, kind in (("updates", Updates), ("between_samples", int)):
             value = getattr(self, name)

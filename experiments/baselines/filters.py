@@ -20,7 +20,7 @@ from shields.runtime.safety_filter import SafetyFilter
 from shields.runtime.set_test import certificate_test
 from shields.verification import require_valid
 
-# Margins that filters and controllers are given, of the safe set and the box, in percent.
+# Margins that filters and controllers are given, in percent of the box, and of the way to a face of the safe set.
 MARGINS = (5, 10, 20, 40, 50)
 # Steps that are looked ahead; a tube leaves no room for more than a few.
 HORIZON, TUBE_HORIZON = 20, 3
@@ -228,7 +228,7 @@ def _tube(
 
 # How each filter is made from a certificate and its plant.
 _NOMINAL: dict[str, Callable[..., Rule]] = {"trusting": CertaintyEquivalentFilter, "psf": PredictiveFilter}
-# Also with margins in percent of the safe set, as in "psf:10", and with a tube.
+# Also with margins in percent, as in "psf:10", and with a tube.
 FILTERS: dict[str, Callable[..., Rule]] = {
     **_NOMINAL,
     **{f"{name}:{each}": partial(make, margin=each / 100) for name, make in _NOMINAL.items() for each in MARGINS},
