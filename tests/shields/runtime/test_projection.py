@@ -203,3 +203,11 @@ def test_closest_points_of_one_input_are_the_same_in_numbers_as_in_arrays():
         np.testing.assert_array_equal(alone, many.item())
         found.append(alone == wanted)
     assert 80 < sum(found) < 720
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_nothing_is_found_without_a_radius(m):
+    still = np.zeros(m)
+    assert closest_admissible(still, still, np.eye(m), -1e-9, np.ones(m)) is None
+    np.testing.assert_array_equal(closest_admissible(still, still, np.eye(m), 0.0, np.ones(m)), still)
+    np.testing.assert_allclose(closest_admissible(still + 0.5, still, np.eye(m), 0.0, np.ones(m)), still, atol=1e-150)
