@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ncs_gym import ChannelContract, LinearPlant
 from ncs_gym.plants.linear_plant import row_limit
 from ncs_gym.validation import counted, printable
-
-if TYPE_CHECKING:
-    pass
 
 _WIDTH, _INDENT = 80, 14
 

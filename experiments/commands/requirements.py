@@ -36,13 +36,6 @@ class RequirementsSettings(PlantSettings):
     out: Path | None = None
 
 
-_TITLES = {
-    "ellipsoid": "ellipsoid's share of the box [%]",
-    "polytope": "polytope's share of the box [%]",
-    "certificate": "100: a certificate, whose share of the box is not known",
-}
-
-
 def requirements(settings: RequirementsSettings) -> None:
     """Runs `ncs requirements`."""
     plant, today, delay = plant_in_use(settings.env or "ncs_gym/CartPole-v0", settings.plant)[1:4]
@@ -52,8 +45,9 @@ def requirements(settings: RequirementsSettings) -> None:
     with synthesis_status() as show:
         found = shields.requirements(plant, ages=ages, resolutions=resolutions, progress=show)
     certified = {each.checksum: each for row in found.certificates for each in row if each is not None}
-    kind = next((share_of(each)[0] for each in certified.values()), "ellipsoid")
-    print(f"{_TITLES[kind]}, by age and resolution of samples\n{text_table(found.cells)}\n")
+    is_known = any(share_of(each)[0] != "certificate" for each in certified.values())
+    title = "share of the box [%]" if is_known else "100: a certificate, whose share of the box is not known"
+    print(f"{title}, by age and resolution of samples\n{text_table(found.cells)}\n")
     for step in found.resolutions:
         largest, where = found.largest_age(step), f"Rounded to {step:g}" if step else "Not rounded"
         if largest is None:

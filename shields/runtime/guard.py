@@ -285,7 +285,7 @@ class MonitorState(NamedTuple):
 class GuaranteeMonitor:
     """Whether x in S is proved now, and why not (docs/shield.md, "How you see that an assumption broke").
 
-    S is the certificate's safe set: its polytope, or its ellipsoid if it has none. In mode "lookahead" it is whether x
+    S is the certificate's safe set, a polytope or an ellipsoid. In mode "lookahead" it is whether x
     is in the box now and stays there: "in S, or in the box with a certified tail stored". The caller keeps the store
     from decision to decision, and drops it where another input is applied.
 

@@ -42,7 +42,7 @@ FLOAT64 = np.dtype(np.float64)
 class Decision(NamedTuple):
     """What the shield decided; of many decisions, arrays whose last axis is the environment.
 
-    S is the certificate's safe set: its polytope, or its ellipsoid if it has none.
+    S is the certificate's safe set, a polytope or an ellipsoid.
 
     Attributes:
         input: Input to apply, shape (m,), within the limits; u_max times a float32 action if not the proposed one.
@@ -80,7 +80,7 @@ class SafetyFilter(ReadOnlyArrays):
     """A certificate made ready to judge inputs (docs/shield.md).
 
     An input passes if everything that one step can reach with it, for every error in E(Sigma_k) and disturbance in
-    E(D), lies in S, or in the certificate's polytope if it has one (`SetTest`). K x_hat needs no test: its safety
+    E(D), lies in S (`SetTest`). K x_hat needs no test: its safety
     follows from x in S by (I) and (U) of docs/shield_proof.md, or from x in the polytope by (P) and (PU).
 
     Args:

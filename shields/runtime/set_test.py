@@ -21,6 +21,7 @@ from shields.polytope import Polytope
 from shields.runtime.projection import closest_admissible, closest_between, closest_in_interval, closest_on_line
 from shields.runtime.rows_within_step import closed, rows_within_step, supports
 from shields.verification import ACTION_ROUNDING
+from shields.verification.polytope_conditions import faces_of
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 
 # The test of all inputs looks at the 2^m vertices of the input box.
@@ -503,7 +504,12 @@ def require_computable(certificate: Certificate, plant: LinearPlant) -> None:
     D_u allows a shift by 2^-24 u_max, twice what rounding an action to float32 does; the other half is for this.
     """
     S = certificate.safe_set
-    extent = S.widths if isinstance(S, Polytope) else np.sqrt(np.diag(S.shape_matrix))
+    if isinstance(S, Polytope):
+        faces = faces_of(S, len(plant.box))
+        assert faces is not None  # it was verified
+        extent = np.array([float(width) for width in faces.widths])
+    else:
+        extent = np.sqrt(np.diag(S.shape_matrix))
     extent = extent + np.sqrt(np.diagonal(certificate.error_shapes, axis1=1, axis2=2)).max(axis=0)
     extent = extent + 2.0 * np.abs(certificate.resting_state)
     sizes = np.abs(certificate.K) @ extent + np.abs(certificate.resting_input)

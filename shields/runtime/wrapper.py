@@ -103,7 +103,7 @@ class SafetyShield(_Shield, gym.Wrapper):
 
     The action passes unchanged if every state the estimate allows stays in S; otherwise "project" applies the closest
     input that keeps it there, "switch" (and "project" where there is none) the certified u = K x_hat. S is the
-    certificate's safe set: its polytope, or its ellipsoid if it has none. From a start in S the true state then stays
+    certificate's safe set, a polytope or an ellipsoid. From a start in S the true state then stays
     in S for ever, for any policy, disturbance and channel within the assumptions; `info["shield_guaranteed"]` says
     whether they still hold as far as can be seen. `SafetyFilter` has the other modes.
 

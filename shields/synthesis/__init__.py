@@ -1,4 +1,4 @@
-"""Offline synthesis of a robust control invariant ellipsoid with its gain, by semidefinite programming.
+"""Offline synthesis of robust control invariant sets with their gains.
 
 `certification` reads as one page: gains and what they bear (`tolerance`), at which the largest ellipsoid begins
 (`ellipsoid_certificates`: alternation between linear matrix inequalities and multipliers), else a polytope alone

@@ -63,8 +63,8 @@ def synthesize(
 ) -> Certificate:
     """Returns a verified certificate; that of the published method is `shields.paper.synthesize`.
 
-    It seeks the largest ellipsoid with hard bounds, and the polytope around it (docs/shield_proof.md). Where there is
-    no ellipsoid, a polytope alone is sought: it bears larger disturbances and errors.
+    It seeks the largest ellipsoid with hard bounds, and the polytope of its gain in its place (docs/shield_proof.md).
+    Where there is no ellipsoid, a polytope alone is sought: it bears larger disturbances and errors.
 
     Args:
         plant: The plant with its bounds, Schur stable without a contract.

@@ -29,11 +29,17 @@ from shields.verification.rational_matrix import (
 def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[Condition]:
     """Returns all conditions; only those of shapes or multipliers where these are wrong: others prove nothing then."""
     updates = certificate.updates
-    S, fits = certificate.safe_set, certificate.K.shape == (plant.m, plant.n)
+    S = certificate.safe_set
+    fits = S.dim == plant.n and certificate.K.shape == (plant.m, plant.n)
     fits = fits and all(proof.inputs is None or len(proof.inputs) == plant.m for proof in certificate.proofs)
     fits = fits and (updates is None or updates.gains.shape[1:] == (plant.n, plant.p))
     conditions = [flag("shapes: K (m, n), gains of updates (n, p), one multiplier of an ellipsoid per input", fits)]
     if not fits:
+        return conditions
+    center = np.zeros(plant.n) if isinstance(S, Ellipsoid) else S.center
+    is_around = np.array_equal(certificate.resting_state, center)
+    conditions.append(flag("S: it is around the resting point", is_around))
+    if not is_around:
         return conditions
     if isinstance(S, Ellipsoid) and not (plant.is_symmetric and not certificate.resting_input.any()):
         return [*conditions, flag("S: an ellipsoid is kept only around zero, within symmetric limits", False)]

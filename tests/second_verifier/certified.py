@@ -34,9 +34,12 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
     yield is_so("shapes: K (m, n), gains of updates (n, p), one multiplier of an ellipsoid per input", fits)
     if not fits:
         return
-    at_rest = [*certificate.resting_state.tolist(), *certificate.resting_input.tolist()]
-    S = certificate.safe_set
-    if isinstance(S, Ellipsoid) and (any(at_rest) or not plant.is_symmetric):
+    S, at_rest = certificate.safe_set, certificate.resting_state.tolist()
+    center = [0.0] * plant.n if isinstance(S, Ellipsoid) else S.center.tolist()
+    yield is_so("S: it is around the resting point", at_rest == center)
+    if at_rest != center:
+        return
+    if isinstance(S, Ellipsoid) and (certificate.resting_input.any() or not plant.is_symmetric):
         yield is_so("S: an ellipsoid is kept only around zero, within symmetric limits", False)
         return
     ranges = list(_range_conditions(certificate))
@@ -56,7 +59,9 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
 def _fits(certificate: Certificate, plant: LinearPlant) -> bool:
     """Returns whether all matrices and multipliers are as many and as large as the plant needs."""
     n, m, p, updates = plant.n, plant.m, plant.p, certificate.updates
-    shapes = [(certificate.K, (m, n)), (certificate.D, (n, n))]
+    S = certificate.safe_set
+    kept = (S.shape_matrix, (n, n)) if isinstance(S, Ellipsoid) else (S.rows, (len(S.rows), n))
+    shapes = [kept, (certificate.K, (m, n)), (certificate.D, (n, n))]
     for proof in certificate.proofs:
         shapes.append((proof.Sigma, (n, n)))
         if proof.shares is not None and proof.inputs is not None:

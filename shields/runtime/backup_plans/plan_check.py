@@ -29,7 +29,7 @@ class PlanTest:
 
     With c_0 = x_hat and c_{i+1} = A c_i + B u_i it is if low + rho_i(c) <= c c_i <= high - rho_i(c) for the rows c of
     the box and i = 1..j-1, which is the exact condition for every possible x_{k+i} to lie in the box, and c_j +
-    E(Sigma_pred,j) lies in S by the one-step test's condition; of a certificate with a polytope P, the same of g c_j
+    E(Sigma_pred,j) lies in S by the one-step test's condition; where S is a polytope P, the same of g c_j
     for the rows g of P, which is exact, too. Then x_{k+j} is in S or P, hence in the box. For j = 1 it is the
     one-step test.
 

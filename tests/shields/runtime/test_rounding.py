@@ -9,6 +9,7 @@ import pytest
 
 from ncs_gym import Channel
 from shields import CertificateError
+from shields.polytope import Polytope
 from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
 from shields.runtime.safety_filter import require_computable
 from shields.runtime.set_test import certified_root, ellipsoid_test
@@ -21,6 +22,7 @@ from shields.verification.rational_matrix import (
     subtract,
 )
 from tests.certificates import certificate_of, with_proof
+from tests.plants import named
 from tests.product import altered, linear_plant, loop_env, safety_filter, safety_shield
 from tests.shields.edges import edge_of
 
@@ -185,3 +187,15 @@ def test_start_far_out_is_recovered_from_only_while_rounding_does_not_count(cert
     for _ in range(199):
         *_, info = env.step(np.zeros(1, np.float32))
     assert info["shield_guaranteed"] is (size < 100.0)
+
+
+def test_polytope_that_is_wider_than_floats_tell_has_no_gain_that_floats_compute():
+    """Its second state gets to 2^50, where the pseudoinverse of the rows says 1."""
+    plant, contract = named("servo")
+    rows = np.array([[1.0, 1.0], [1.0, 1.0 + 2.0**-50]])
+    thin = replace(
+        certificate_of(plant, contract, "polytope"), safe_set=Polytope(rows=rows, multipliers=np.zeros((3, 2)))
+    )
+    assert thin.safe_set.widths.max() < 2.0
+    with pytest.raises(CertificateError, match="the gain is too large"):
+        require_computable(thin, plant)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 from collections import defaultdict
 from dataclasses import replace
@@ -21,7 +22,7 @@ from tests.plants import named
 from tests.product import safety_filter
 from tests.verdicts import assert_true, broken, verified
 
-# Plants of `named`, and what is kept; with a polytope, the ellipsoid is proved, too, but for the first and third servo.
+# Plants of `named`, and what is kept.
 CASES = {
     "ellipsoid": ("stable", "ellipsoid"),
     "ellipsoid, contract": ("unstable", "ellipsoid"),
@@ -53,8 +54,7 @@ def read(content):
 
 
 def numbers_of(content):
-    """Paths of numbers that must change together, as others contradict each other: both halves of a symmetric matrix,
-    and what is repeated of the largest age."""
+    """Paths of numbers that must change together, as others contradict each other: halves of a symmetric matrix."""
     together = defaultdict(list)
     for path in paths(content):
         together[meaning(path)].append(path)
@@ -193,6 +193,13 @@ def of_three_states(certificate):
     )
 
 
+def elsewhere(certificate):
+    """Resting at another point than its set is around, which no constructor lets pass."""
+    forged = pickle.loads(pickle.dumps(certificate))
+    object.__setattr__(forged, "resting_state", certificate.resting_state + 1e-3)
+    return forged
+
+
 def with_polytope(certificate, **changes):
     changes = dict.fromkeys(("lower_multipliers", "low", "high", "center")) | changes  # of one that is symmetric
     return replace(certificate, safe_set=replace(certificate.safe_set, **changes))
@@ -232,6 +239,8 @@ OF_CERTIFICATE = [
     ("ellipsoid", "plant", lambda c: replace(c, fingerprint="0" * 64)),
     ("ellipsoid", "shapes", lambda c: with_multipliers(c, inputs=(0.5, 0.5))),
     ("ellipsoid", "shapes", of_three_states),
+    ("ellipsoid", "S: it is around the resting point", elsewhere),
+    ("polytope", "S: it is around the resting point", elsewhere),
     ("ellipsoid", "multipliers: finite", lambda c: with_multipliers(c, rounding=float("inf"))),
     ("ellipsoid", "multipliers: finite", lambda c: with_multipliers(c, state=float("nan"))),
     # With a rate or multiplier below zero the sums of (E1) and (U) have terms of the wrong sign, and hold.
