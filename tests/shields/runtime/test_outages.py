@@ -146,8 +146,9 @@ def test_actuator_takes_commands_of_its_episode_alone_and_repeats_nothing():
 @pytest.mark.parametrize("skipped", [1, 3])
 def test_actuator_counts_each_step_that_it_left_out(skipped):
     actuator = Actuator(0, 1)
-    actuator.receive([Command(step, np.ones((1, 1))) for step in (0, skipped + 1)])
-    assert [actuator.apply(step).item() for step in (0, skipped + 1)] == [1.0, 1.0]
+    for step in (0, skipped + 1):
+        actuator.receive([Command(step, np.ones((1, 1)))])
+        assert actuator.apply(step).item() == 1.0
     assert actuator.echo.missing == skipped
 
 
