@@ -45,11 +45,11 @@ def certificate_of_package(
     plant: LinearPlant, contract: ChannelContract | None = None, safe_set: str | None = None
 ) -> Certificate | None:
     """Returns the certificate that comes with the package for a plant and a contract; None if there is none."""
-    kind = Ellipsoid if safe_set == "ellipsoid" else Polytope
+    kinds = {None: Polytope, "polytope": Polytope, "ellipsoid": Ellipsoid}
     for file in sorted(Path(__file__).parent.glob("*.json")):
         if plant.fingerprint in file.read_text(encoding="utf-8"):
             certificate = Certificate.load(file)
-            if certificate.contract == contract and isinstance(certificate.safe_set, kind):
+            if certificate.contract == contract and type(certificate.safe_set) is kinds.get(safe_set):
                 return certificate
     return None
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, truck_trailer
-from shields import Certificate, CertificateError, Infeasible, requirements, verify
+from shields import Certificate, CertificateError, Infeasible, certificate_for, requirements, verify
 from shields.certificate import Proof
 from shields.documents import document_of
 from shields.paper.synthesis import kappa_rho_grid
@@ -50,6 +50,7 @@ def read_multipliers(first):
 
 REFUSED = [
     (lambda: synthesize(plant(), safe_set="Polytope"), ValueError, "safe_set must be"),
+    (lambda: certificate_for(truck_trailer(), None, "Ellipsoid"), ValueError, "safe_set must be"),
     *(
         (
             lambda name=name: paper_synthesis(altered(plant(), **{name: 1e-4})),
