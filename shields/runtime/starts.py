@@ -36,7 +36,7 @@ class StartKnown(NamedTuple):
     """What is known of the start of an episode before any estimate.
 
     Attributes:
-        in_safe_set: Whether every possible start lies in the certificate's safe set: in S.
+        in_safe_set: Whether every possible start lies in S, the certificate's safe set.
         in_box: Whether every possible start lies in the safe box; in modes without plans, in the safe set.
     """
 
