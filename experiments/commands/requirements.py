@@ -14,7 +14,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.network.channel import in_time
 from ncs_gym.validation import counted
 from shields.packaged_certificates import synthesis_status
-from shields.synthesis.network_requirements import AGES, share_of
+from shields.synthesis.network_requirements import AGES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +45,7 @@ def requirements(settings: RequirementsSettings) -> None:
     with synthesis_status() as show:
         found = shields.requirements(plant, ages=ages, resolutions=resolutions, progress=show)
     certified = {each.checksum: each for row in found.certificates for each in row if each is not None}
-    is_known = any(share_of(each)[0] != "certificate" for each in certified.values())
-    title = "share of the box [%]" if is_known else "100: a certificate, whose share of the box is not known"
-    print(f"{title}, by age and resolution of samples\n{text_table(found.cells)}\n")
+    print(f"share of the box [%], by age and resolution of samples\n{text_table(found.cells)}\n")
     for step in found.resolutions:
         largest, where = found.largest_age(step), f"Rounded to {step:g}" if step else "Not rounded"
         if largest is None:

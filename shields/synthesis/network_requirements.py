@@ -57,7 +57,7 @@ class Requirements:
 
     @property
     def cells(self) -> list[list[str]]:
-        """The table as texts: shares of the safe box [%], - where no certificate was found, the header first."""
+        """The table as texts, header first: shares of the safe box [%], "yes" where not known, "-" without certificate."""
         header = ["max_age [steps]", *(f"{step:g}" for step in self.resolutions)]
         rows = zip(self.ages, self.certificates, strict=True)
         return [header, *([str(age), *map(_cell, found)] for age, found in rows)]
@@ -68,20 +68,22 @@ class Requirements:
         return {
             "ages": list(self.ages),
             "resolutions": list(self.resolutions),
-            "shares": [[each and share_of(each)[1] for each in row] for row in self.certificates],
+            "shares": [[each and share_of(each) for each in row] for row in self.certificates],
             "certificates": [[each and each.checksum for each in row] for row in self.certificates],
         }
 
 
-def share_of(certificate: Certificate) -> tuple[str, float]:
-    """Returns what fills how much of the safe box: "ellipsoid", "polytope", or ("certificate", 1.0) if not known."""
-    known, names = certificate.provenance, ("share_of_box", "share_of_box_at_rest", "volume_of_box_ellipsoid")
-    share = next((known[name] for name in names if name in known), None)
-    return ("certificate", 1.0) if share is None else (type(certificate.safe_set).__name__.lower(), float(share))
+def share_of(certificate: Certificate) -> float | None:
+    """Returns how much of the safe box the safe set fills; None if that is not known."""
+    names = ("share_of_box", "share_of_box_at_rest", "volume_of_box_ellipsoid")
+    return next((float(certificate.provenance[name]) for name in names if name in certificate.provenance), None)
 
 
 def _cell(certificate: Certificate | None) -> str:
-    return "-" if certificate is None else f"{100.0 * share_of(certificate)[1]:.3g}"
+    if certificate is None:
+        return "-"
+    share = share_of(certificate)
+    return "yes" if share is None else f"{100.0 * share:.3g}"
 
 
 @np.errstate(all="ignore")
@@ -127,5 +129,5 @@ def requirements(
         for j in reversed(range(len(steps))):
             stricter = (*(row[j] for row in found[i + 1 : i + 2]), *found[i][j + 1 : j + 2])
             certified = [each for each in (found[i][j], *stricter) if each is not None]
-            found[i][j] = max(certified, key=lambda each: share_of(each)[1], default=None)
+            found[i][j] = max(certified, key=lambda each: share_of(each) or 0.0, default=None)
     return Requirements(ages=tuple(asked), resolutions=tuple(steps), certificates=tuple(map(tuple, found)))
