@@ -57,7 +57,7 @@ class Requirements:
 
     @property
     def cells(self) -> list[list[str]]:
-        """The table as texts, header first: shares of the safe box [%], "yes" where not known, "-" without certificate."""
+        """The table as texts, header first: shares of the safe box [%], "yes" where not known, "-" for none."""
         header = ["max_age [steps]", *(f"{step:g}" for step in self.resolutions)]
         rows = zip(self.ages, self.certificates, strict=True)
         return [header, *([str(age), *map(_cell, found)] for age, found in rows)]
