@@ -163,7 +163,7 @@ def _deciding(shield: SafetyFilter, inside: Certificate, count: int) -> Callable
     """Returns decisions about estimates in the safe set of a certificate, and random inputs."""
     rng, plant = np.random.default_rng(0), shield.plant
     estimates = (inside.safe_set.sample_boundary(rng, count) * rng.uniform(0.2, 0.9, (count, 1))).T.copy()
-    proposals = rng.uniform(-1.0, 1.0, (plant.m, count)) * plant.u_max[:, None]
+    proposals = rng.uniform(-1.0, 1.0, (plant.m, count)) * plant.largest_input[:, None]
     errors = shield.errors_of(0.5 * shield.certificate.error_shapes[0])
     if count == 1:
         return lambda: shield.decide(estimates[:, 0], errors, proposals[:, 0])

@@ -35,6 +35,16 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
     return _rounded(_rational(matrix).inv())
 
 
+def pseudoinverse(rows: np.ndarray) -> np.ndarray:
+    """Returns (C'C)^-1 C' of a float matrix C, shape (n, k), every entry rounded once.
+
+    Raises:
+        ZeroDivisionError: If its columns are not independent.
+    """
+    exact = _rational(rows)
+    return _rounded((exact.transpose() * exact).inv() * exact.transpose())
+
+
 def rank(matrix: np.ndarray) -> int:
     """Returns the rank of a float matrix."""
     return int(_rational(matrix).rank())

@@ -213,28 +213,6 @@ class LimitValues(ReadOnlyArrays):
         return float(np.abs(np.linalg.eigvals(self.A)).max())
 
     @cached_property
-    def is_symmetric(self) -> bool:
-        """Whether the limits are |c_j x| <= 1 and |u_i| <= u_max_i, and no others."""
-        low, high = np.concatenate([self.box_ends, self.input_ends], axis=1)
-        units = high[: len(self.box)] == 1.0
-        return bool(units.all()) and np.array_equal(-low, high) and not len(self.mixed_rows)
-
-    @property
-    def box_rows(self) -> np.ndarray:
-        """Rows c_j of a symmetric safe box |c_j x| <= 1, shape (k, n); raises ValueError if limits are others."""
-        return self._if_symmetric(self.box)
-
-    @property
-    def u_max(self) -> np.ndarray:
-        """Symmetric limits |u_i| <= u_max_i, shape (m,); raises ValueError if limits are others."""
-        return self._if_symmetric(self.input_ends[1])
-
-    def _if_symmetric(self, value: np.ndarray) -> np.ndarray:
-        if not self.is_symmetric:
-            raise ValueError("this needs limits |c_j x| <= 1 and |u_i| <= u_max_i alone, and the plant has others")
-        return value
-
-    @cached_property
     def input_middle(self) -> np.ndarray:
         """The input that action 0 stands for, shape (m,): the middle of the limits."""
         return read_only(0.5 * self.input_ends.sum(axis=0))
@@ -271,12 +249,12 @@ class LimitValues(ReadOnlyArrays):
         two_ends = np.isfinite(self.box_ends).all(axis=0)
         limited, reach = self.box[two_ends].any(axis=0), np.full(n, np.inf)
         with suppress(ZeroDivisionError):  # rows that limit a sum alone
-            reach[limited] = self._widest(limited)
+            reach[limited] = self.widest(limited)
         reach = np.minimum(reach, np.abs(self.own_limits).max(axis=0))
         reach[n - self.past :] = np.tile(self.largest_input, self.past // m)
         return read_only(np.concatenate([reach, self.largest_input]))
 
-    def _widest(self, states: Any = slice(None)) -> np.ndarray:
+    def widest(self, states: Any = slice(None)) -> np.ndarray:
         """Returns bounds of some |x_i| in the safe box by x = (C'C)^-1 C' (C x), C having two ends.
 
         Raises:
@@ -284,8 +262,7 @@ class LimitValues(ReadOnlyArrays):
         """
         bounded = np.isfinite(self.box_ends).all(axis=0)
         rows, sizes = self.box[:, states][bounded], np.abs(self.box_ends[:, bounded]).max(axis=0)
-        gram = exact.product(rows.T, rows)
-        return (np.abs(exact.product(exact.inverse(gram), rows.T)) * sizes).sum(axis=1)
+        return (np.abs(exact.pseudoinverse(rows)) * sizes).sum(axis=1)
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns how far c_j x is beyond the nearer end, in units of half the range, shape (k,) or (k, N).

@@ -25,7 +25,9 @@ from shields.documents import content_of, document_of, write_document
 from shields.errors import CertificateError
 from shields.polytope import Polytope, polytope_content, polytope_of
 
-_FORMAT = "ncs-gym certificate 4"
+_FORMAT = "ncs-gym certificate 5"
+# What is claimed unless the certificate says more.
+_AT_SAMPLES = "at the sampling instants; nothing is claimed of the times between them"
 # Parts of a point that are smaller than this share of the set are shown as zero.
 _DUST = 1e-9
 # Fields of a `Proof` with an ellipsoid, and those of `Updates` that are arrays.
@@ -136,8 +138,6 @@ class Certificate(ReadOnlyArrays):
         resting_state: x_c of the fallback input u = u_c + K (x_hat - x_c), shape (n,): an equilibrium without
             estimation error and disturbance; zero, the plant's operating point, by default.
         resting_input: u_c, shape (m,).
-        between_samples: The plant's: with it the state is claimed to be in the box at all times, None claims it at the
-            sampling instants.
         fingerprint: That of the plant.
         provenance: How the certificate was made (solver, versions, volume); it proves nothing.
     """
@@ -150,7 +150,6 @@ class Certificate(ReadOnlyArrays):
     updates: Updates | None = None
     resting_state: np.ndarray = FILLED_IN_LATER
     resting_input: np.ndarray = FILLED_IN_LATER
-    between_samples: int | None = None
     fingerprint: str
     provenance: dict[str, Any] = field(default_factory=dict)
 
@@ -174,10 +173,8 @@ class Certificate(ReadOnlyArrays):
             raise ValueError("its provenance must be a dict, and its fingerprint a text")
         if type(self.safe_set) not in (Ellipsoid, Polytope):
             raise ValueError("its safe set must be an Ellipsoid or a Polytope")
-        for name, kind in (("updates", Updates), ("between_samples", int)):
-            value = getattr(self, name)
-            if value is not None and type(value) is not kind:
-                raise ValueError(f"its {name} must be of type {kind.__name__}")
+        if type(self.updates) not in (Updates, type(None)):
+            raise ValueError("its updates must be of type Updates")
 
     def _check_error_sets(self, n: int) -> None:
         """Raises ValueError unless there is a proof for every age, and all error sets have n dimensions."""
@@ -243,10 +240,7 @@ class Certificate(ReadOnlyArrays):
         return f"<Certificate for the plant {self.fingerprint[:16]}, {self.contract or 'without a contract'}>"
 
     def __str__(self) -> str:
-        (m, n), recorded, points, kept = self.K.shape, self.provenance, self.between_samples, self.safe_set
-        claim = f"at all times ({points} of each step, and a bound on what is between them)"
-        if points is None:
-            claim = "at the sampling instants; nothing is claimed of the times between them"
+        (m, n), recorded, kept = self.K.shape, self.provenance, self.safe_set
         if isinstance(kept, Polytope):
             form = "|g x| <= 1" if kept.is_symmetric else "low <= g x <= high"
             safe_set, sizes = f"the polytope {form} of {len(kept.rows)} rows g", np.nan_to_num(kept.widths, posinf=0.0)
@@ -264,7 +258,7 @@ class Certificate(ReadOnlyArrays):
         rows = [
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
             ("safe set", safe_set),
-            ("claim", f"in the safe box {claim}"),
+            ("claim", f"in the safe box {recorded.get('claim', _AT_SAMPLES)}"),
             ("size", size_of(recorded)),
             ("fallback", fallback),
             ("contract", contract_text(self.contract)),
@@ -340,7 +334,6 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
         and {"contract": asdict(updates.contract)} | {name: getattr(updates, name).tolist() for name in _OF_UPDATES},
         "resting_state": c.resting_state.tolist(),
         "resting_input": c.resting_input.tolist(),
-        "between_samples": c.between_samples,
         "fingerprint": c.fingerprint,
         "provenance": c.provenance,
     }
@@ -348,7 +341,7 @@ def _content_of(certificate: Certificate) -> dict[str, Any]:
 
 def _fields_of(content: dict[str, Any]) -> dict[str, Any]:
     """Raises KeyError, TypeError or ValueError if an entry is missing or of a wrong kind."""
-    names = ("K", "D", "resting_state", "resting_input", "between_samples", "fingerprint", "provenance")
+    names = ("K", "D", "resting_state", "resting_input", "fingerprint", "provenance")
     fields = {name: content[name] for name in names}
     kept, errors, updates = content["safe_set"], content["errors"], content["updates"]
     shapes, rates = errors["shapes"], errors["rates"]

@@ -132,11 +132,10 @@ class _Fallbacks:
 
     def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
         rest, n, k = certificate.fallback, plant.n, len(plant.box)
-        limits = around(limit_rows(plant, plant.disturbance.shape_matrix), Rest(rest.resting_state, rest.resting_input))
-        # Where the box counts at samples alone, it is known to hold S.
-        self._rows_on_states, self._first = k, 0 if plant.grid_rows is not None else k
+        limits = around(limit_rows(plant), Rest(rest.resting_state, rest.resting_input))
+        self._rows_on_states = k  # within which S is known to lie
         self._low, self._high = limits.low, limits.high
-        self._own = limits.disturbed + MARGIN * np.minimum(np.abs(self._low), np.abs(self._high))
+        self._own = MARGIN * np.minimum(np.abs(self._low), np.abs(self._high))
         self._on_state, self._on_input = limits.rows[:, :n], limits.rows[:, n:]
         self._on_estimate = self._on_state + self._on_input @ rest.gain
         self._powers, self._loops = _powers(plant.A), _powers(plant.A + plant.B @ rest.gain)
@@ -159,7 +158,7 @@ class _Fallbacks:
 
         The state is in S or, if a share is given, its estimate in that share of S.
         """
-        if not self._keeps(age, 0, share)[self._first :].all():
+        if not self._keeps(age, 0, share)[self._rows_on_states :].all():
             return 0
         for steps in range(1, most + 1):
             kept = self._keeps(age, steps, share)

@@ -52,7 +52,11 @@ def keep_certificates(folder_of: Callable[[str, Callable[[Path], None]], Path]) 
 def certificate_of(
     plant: LinearPlant, contract: ChannelContract | None = None, safe_set: str = "ellipsoid"
 ) -> Certificate:
-    """The certificate of a plant under a contract: checked in, or synthesized once for a state of the source."""
+    """The certificate of a plant under a contract: checked in, or synthesized once for a state of the source.
+
+    It is of a polytope where limits within a step leave no ellipsoid.
+    """
+    safe_set = "polytope" if len(plant.step_rows) else safe_set
     key = plant.fingerprint, contract, safe_set
     if key not in _certificates:
         _certificates[key] = _read_or_synthesized(plant, contract, safe_set)

@@ -70,13 +70,13 @@ def assert_true(certificate: Certificate, plant: LinearPlant) -> None:
     assert (reach(a) > 0.0).all()
     errors = np.max([support(gain @ Sigma @ gain.T, rows) for Sigma in certificate.error_shapes], axis=0)
     assert (reach(rows @ closed) + errors + support(D, rows) <= ROUNDING * reach(rows)).all()
-    assert (reach(plant.box_rows) <= ROUNDING).all()
+    assert (reach(plant.box) <= ROUNDING).all()
     used = np.max([support(Sigma, K) for Sigma in certificate.error_shapes], axis=0)
-    assert (reach(K) + used <= ROUNDING * plant.u_max).all()
-    for within in between(plant, 20 if certificate.between_samples else 0):
+    assert (reach(K) + used <= ROUNDING * plant.largest_input).all()
+    for within in between(plant, 20 if plant.between_samples else 0):
         moved = within[:, : plant.n] + within[:, plant.n :] @ K
         pushed = [support(Sigma, within[:, plant.n :] @ K) for Sigma in certificate.error_shapes]
-        assert (reach(moved) + np.max(pushed, axis=0) + support(D, plant.box_rows) <= ROUNDING).all()
+        assert (reach(moved) + np.max(pushed, axis=0) + support(D, plant.box) <= ROUNDING).all()
 
 
 def assert_errors_stay(certificate: Certificate, plant: LinearPlant, a: np.ndarray) -> None:

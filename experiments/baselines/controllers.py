@@ -23,7 +23,7 @@ from experiments.baselines.observer import DisturbanceObserver
 from ncs_gym import LinearPlant, NCSEnv, Regulation, SetpointTracking, SpeedTracking, Task
 from ncs_gym.plants.lqr import lqr_gain
 from shields.certificate import Fallback
-from shields.runtime.rows_within_step import closed, rows_within_step
+from shields.runtime.set_test import closed
 
 # Its types are not declared.
 _clarabel: Any = clarabel
@@ -167,17 +167,17 @@ def model_predictive(env: NCSEnv, weights: RegulatorWeights, margin: float = 0.0
     plant, problem, steps = env.plant, regulator_problem(env, weights), PREDICTED_STEPS
     A, B, E, D, m = problem.A, problem.B, problem.E, problem.D, plant.m
     to_go = np.real(sqrtm(solve_discrete_are(A, B, E.T @ E, D.T @ D, s=E.T @ D)))
-    beyond, grid = ((0, 0), (0, len(A) - plant.n)), rows_within_step(plant)
-    rows, between = np.pad(plant.box, beyond), np.pad(grid.state, beyond)
-    low, high = closed(np.concatenate([grid.low, plant.box_ends[0]]), np.concatenate([grid.high, plant.box_ends[1]]))
+    beyond, (of_state, pushed) = ((0, 0), (0, len(A) - plant.n)), np.hsplit(plant.step_rows, [plant.n])
+    rows, between = np.pad(plant.box, beyond), np.pad(of_state, beyond)
+    low, high = closed(*np.hstack([plant.step_ends, plant.kept_ends]))
     low, high = np.tile(low + margin, steps), np.tile(high - margin, steps)
-    every_row = np.block([[between, grid.input], [rows, np.zeros((len(rows), m))]])
+    every_row = np.block([[between, pushed], [rows, np.zeros((len(rows), m))]])
     least, most = (np.tile(ends, steps) for ends in plant.input_ends)
     free, forced, costs, limits = np.eye(len(A)), np.zeros((len(A), steps * m)), [], []
     for k in range(steps):  # z_k = free z_0 + forced u
         now = np.eye(steps * m)[k * m : (k + 1) * m]
         costs.append((E @ free, E @ forced + D @ now))
-        limits.append((between @ free, between @ forced + grid.input @ now))
+        limits.append((between @ free, between @ forced + pushed @ now))
         free, forced = A @ free, A @ forced + B @ now
         limits.append((rows @ free, rows @ forced))
     costs.append((to_go @ free, to_go @ forced))

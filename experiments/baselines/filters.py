@@ -15,9 +15,8 @@ from shields import Certificate
 from shields.polytope import Polytope
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
-from shields.runtime.rows_within_step import closed, rows_within_step
 from shields.runtime.safety_filter import SafetyFilter
-from shields.runtime.set_test import certificate_test
+from shields.runtime.set_test import certificate_test, closed
 from shields.verification import require_valid
 
 # Margins that filters and controllers are given, in percent of the box, and of the way to a face of the safe set.
@@ -61,9 +60,8 @@ class PredictiveFilter:
         min |u_0 - proposed|^2  s.t.  x_{i+1} = A x_i + B u_i,  u_i within the limits,
                                       low_j + t_ij <= c_j x_i <= high_j - t_ij (0 < i < N),  |x_N|_M <= 1 - t_N,
 
-    or low + t_N(g) <= g x_N <= high - t_N(g) for the rows g of the certificate's polytope, if it has one. Where the box
-    counts between samples, its limits hold at these times, too, tightened as at the worse of the two samples, and so do
-    limits of states and inputs together.
+    or low + t_N(g) <= g x_N <= high - t_N(g) for the rows g of the certificate's polytope, if it has one. Limits within
+    a step hold, too: of states and inputs together, and of the box at other times.
     The tightenings t are zero, a margin, the same for all, or those of a tube: with u_i + K (x_hat_i - x_i) applied,
     the true state is off x_i by (A+BK)^i e_0 + sum_j (A+BK)^j (B K e + d), each term as large as the certificate's
     error sets and the plant's disturbance let it be. Where the proposed input followed by u = K x is such a plan
@@ -82,7 +80,7 @@ class PredictiveFilter:
 
     Raises:
         CertificateError: If the certificate does not verify for the plant.
-        ValueError: If a tube is asked for where states and inputs have limits together.
+        ValueError: If a tube is asked for where there are limits within a step.
     """
 
     def __init__(
@@ -101,7 +99,7 @@ class PredictiveFilter:
         self._root, self._ends_in_ellipsoid = test.root, isinstance(S, Ellipsoid)
         self._prediction = Prediction(test, horizon)
         self._program = PlanProgram(self._prediction)
-        self._middle, half = _middle_and_half(*plant.box_ends)
+        self._middle, half = _middle_and_half(*plant.kept_ends)
         at_samples = np.tile(half - margin, (horizon + 1, 1))
         self._end_middle, end_half, to_face = np.zeros(1), np.ones(1), np.ones(1)
         if isinstance(S, Polytope):
@@ -110,28 +108,17 @@ class PredictiveFilter:
             to_face = np.minimum(S.high - reached, reached - S.low)
         self._end_limits = end_half - margin * to_face
         if tube:
-            if len(plant.mixed_rows):
-                raise ValueError("a tube knows no limits of states and inputs together")
+            if len(plant.step_rows):
+                raise ValueError("a tube knows no limits of states and inputs together, nor of times between samples")
             reach, end = _tube(certificate, plant, self._end_sizes, horizon)
             at_samples, self._end_limits = at_samples - reach, self._end_limits - end
         self._limits = at_samples[1:-1]
-        # As the program takes it, whose rows of the box are shorter by what a disturbance does between samples; the
-        # last row is for ends in P.
         k, ends = len(plant.box), len(self._end_limits)
-        self._all_limits = np.ones((horizon, max(k, ends)))
-        longer = np.linalg.norm(self._prediction.rows[:k], axis=1) / np.linalg.norm(plant.box, axis=1)
-        shrunk = self._prediction.half[:k]
-        self._all_limits[:-1, :k] = shrunk - 1.0 + (self._limits + (1.0 - half)) * longer
-        self._all_limits[-1, :ends] = self._end_limits
-        if isinstance(S, Polytope):  # its first rows are those of the box
-            self._all_limits[-1, :k] += shrunk - half
+        self._all_limits = np.ones((horizon, max(k, ends)))  # the last row is for ends in P
+        self._all_limits[:-1, :k], self._all_limits[-1, :ends] = self._limits, self._end_limits
         self._weighting = self._root[: test.cone]
-        self._grid = rows_within_step(plant)
-        self._grid_middle, grid_half = _middle_and_half(self._grid.low, self._grid.high)
-        times = (len(grid_half) - len(plant.mixed_rows)) // k
-        left = np.tile(np.minimum(at_samples[:-1], at_samples[1:]) + (1.0 - half), times)
-        mixed = np.full((horizon, len(plant.mixed_rows)), 1.0 - margin)
-        self._between = grid_half - 1.0 + np.hstack([left, mixed])
+        self._step_middle, step_half = _middle_and_half(*plant.step_ends)
+        self._within = step_half - margin
 
     def __call__(self, estimates: np.ndarray, proposed: np.ndarray, begun: np.ndarray) -> np.ndarray:
         """Returns the inputs to apply, shape (N, m), as a `Rule`; plans of before an episode began are void."""
@@ -153,8 +140,8 @@ class PredictiveFilter:
         """Returns where a proposed input and then u = K x are a plan, (N,), and these inputs, (N, horizon - 1, m)."""
         plant, states, inputs, plans = self._plant, estimates, proposed, []
         fine = np.ones(len(states), np.bool_)
-        for between, limits in zip(self._between, [*self._limits, np.full(len(plant.box), np.inf)], strict=True):
-            fine &= (np.abs(self._grid.values(states, inputs) - self._grid_middle) <= between).all(axis=1)
+        for limits in [*self._limits, np.full(len(plant.box), np.inf)]:
+            fine &= self._keeps_within_steps(states, inputs, 0.0)
             states = states @ plant.A.T + inputs @ plant.B.T
             fine &= (np.abs(states @ plant.box.T - self._middle) <= limits).all(axis=1)
             inputs = self._gained(states)
@@ -169,15 +156,21 @@ class PredictiveFilter:
         if not (missed <= self._limits[0]).all() or (self._end_limits <= 0.0).any():
             return None  # no input brings the next state into the box, or nothing is left of the end
         radius = float(self._end_limits[0])  # counts for ends in S
-        plan = self._program.solve(estimate, self._all_limits, self._weighting, radius, self._between, proposed)
+        within = np.tile(self._within, (self._horizon, 1))
+        plan = self._program.solve(estimate, self._all_limits, self._weighting, radius, within, proposed)
         if plan is None:
             return None
         plan = np.clip(plan, *plant.input_ends)
         centers = self._prediction.centers(estimate[None], plan[None, None])[..., 0, 0]
         inside = (np.abs(centers[:-1] @ plant.box.T - self._middle) <= self._limits + TOLERANCE).all()
         begun = np.vstack([estimate, centers[:-1]])
-        inside &= (np.abs(self._grid.values(begun, plan) - self._grid_middle) <= self._between + TOLERANCE).all()
+        inside &= self._keeps_within_steps(begun, plan, TOLERANCE).all()
         return plan if inside and (self._levels(centers[-1]) <= self._end_limits + TOLERANCE).all() else None
+
+    def _keeps_within_steps(self, states: np.ndarray, inputs: np.ndarray, tolerance: float) -> np.ndarray:
+        """Returns whether limits within a step are kept, of shape (N, n) and (N, m): shape (N,)."""
+        values = np.hstack([states, inputs]) @ self._plant.step_rows.T
+        return np.all(np.abs(values - self._step_middle) <= self._within + tolerance, axis=1)
 
     def _levels(self, states: np.ndarray) -> np.ndarray:
         """Returns |x|_M, shape (..., 1), or how far the rows g x of P are from their middles, shape (..., r)."""

@@ -97,7 +97,7 @@ class Loop:
             "certificate_contract": certificate_contract,
             "noise": as_noise(self.noise, plant),
             "downlink_contract": None if self.downlink is None else protocol.contract,
-            "limits_the_way": plant.between_samples is not None or len(plant.mixed_rows) > 0,
+            "limits_the_way": len(plant.step_rows) > 0,
             "oldest": largest_age(contract),
         }
         for name, value in values.items():

@@ -22,6 +22,7 @@ from ncs_gym import exact
 from ncs_gym.bounds import DELTA, Ball, Bounds, Sum, pushes_of
 from ncs_gym.limits import Limits, LimitValues, reach_in_steps, weight_of
 from ncs_gym.model import Model
+from ncs_gym.plants.between_samples import kept_at_all_times
 from ncs_gym.reading import json_values, read_text
 from ncs_gym.uncertainty.ellipsoid import (
     Ellipsoid,
@@ -124,26 +125,6 @@ _NUMBERS = (
 )
 _FORMAT = "ncs-gym plant 2"
 _VALUES: dict[str, type] = {"model": Model, "limits": Limits, "bounds": Bounds}
-# What the bound between grid points gains for the rounding of rows, relative to itself and to what a row reaches.
-GRID_MARGIN, GRID_ROUNDING = 0.01, 1e-12
-
-
-class GridRows(NamedTuple):
-    """The rows c of the safe box as rows on x and u at the times tau_i = i dt / N of a step, i = 0..N-1.
-
-    With the input held, x(tau) = A_tau x + B_tau u + d_tau, where [A_tau, B_tau] is the upper part of exp(G tau) for
-    G = [[Ac, Bc], [0, 0]] (docs/shield_proof.md, "Between the samples").
-
-    Attributes:
-        state: c A_tau, shape (N, k, n).
-        input: c B_tau, shape (N, k, m).
-        remainder: eta, shape (k,): for x in the box and u within its limits, c (A_tau x + B_tau u) is nowhere beyond
-            its values at the two grid points around tau by more than this, the rounding of the rows included.
-    """
-
-    state: np.ndarray
-    input: np.ndarray
-    remainder: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -162,6 +143,10 @@ class LinearPlant(LimitValues):
         region: Digest of the model and the limits, which a remainder belongs to.
         state_names, state_units, input_names, input_units: The labels, with defaults.
         dt, continuous_model, between_samples: Those of the model and the limits.
+        kept_ends: Ends of `box` that proofs keep at the sampling instants, shape (2, k): `box_ends`, or closer ones
+            where the box counts between samples, too.
+        step_rows, step_ends: Limits of (x, u) at the beginning of a step that proofs keep, shapes (g, n + m) and (2,
+            g): the mixed ones, and rows of the box at the other times of the step, by time.
         n, m, p: Number of states, inputs and outputs.
         of_disturbance, of_sensor, of_first_error: What is declared of each; other attributes name parts of these.
         remainder: What the model leaves out of the process that really moves; None if nothing.
@@ -187,6 +172,9 @@ class LinearPlant(LimitValues):
     of_sensor: Source = field(init=False)
     of_first_error: Source = field(init=False)
     remainder: Any = field(init=False)
+    kept_ends: np.ndarray = field(init=False)
+    step_rows: np.ndarray = field(init=False)
+    step_ends: np.ndarray = field(init=False)
     delta: float = field(init=False)
     dt = setting("dt", "model.dt")
     continuous_model = setting("continuous_model", "model.continuous")
@@ -217,6 +205,7 @@ class LinearPlant(LimitValues):
         self._set(**vars(whole), n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
         self._declare([declared, *sums[1:]], rest)
         self._name()
+        self._set(kept_ends=self.box_ends, step_rows=self.mixed_rows, step_ends=self.mixed_ends)
         if self.between_samples is not None:
             has_remainder = len(declared.parts) < len(sums[0].parts)
             if self.continuous_model is None or self.past or has_remainder or self.step_offset.any():
@@ -225,6 +214,7 @@ class LinearPlant(LimitValues):
             if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
                 ends = "two ends that bound every state: give generous ones"
                 raise ValueError(f"between_samples needs Limits with {ends}")
+            self._set(**kept_at_all_times(self))
         if owned := [each.of_plant(self) for each in sums[0].parts if each.is_left_out]:
             disturbance = Sum((*declared.parts, *owned))
             self._set(remainder=owned[0], bounds=replace(self.bounds, disturbance=disturbance))
@@ -363,6 +353,28 @@ class LinearPlant(LimitValues):
         return None if self.remainder is None else self.remainder.family
 
     @cached_property
+    def is_symmetric(self) -> bool:
+        """Whether the limits are |c_j x| <= 1 and |u_i| <= u_max_i, and no others."""
+        low, high = np.concatenate([self.box_ends, self.input_ends], axis=1)
+        units = high[: len(self.box)] == 1.0
+        return bool(units.all()) and np.array_equal(-low, high) and not len(self.step_rows)
+
+    @property
+    def box_rows(self) -> np.ndarray:
+        """Rows c_j of a symmetric safe box |c_j x| <= 1, shape (k, n); raises ValueError if limits are others."""
+        return self._if_symmetric(self.box)
+
+    @property
+    def u_max(self) -> np.ndarray:
+        """Symmetric limits |u_i| <= u_max_i, shape (m,); raises ValueError if limits are others."""
+        return self._if_symmetric(self.input_ends[1])
+
+    def _if_symmetric(self, value: np.ndarray) -> np.ndarray:
+        if not self.is_symmetric:
+            raise ValueError("this needs limits |c_j x| <= 1 and |u_i| <= u_max_i alone, and the plant has others")
+        return value
+
+    @cached_property
     def state_limit(self) -> np.ndarray:
         """Where a simulation stops a state that runs away, shape (n,); infinite for a stable plant."""
         return read_only(FARTHEST * self.half_widths if self.spectral_radius >= 1.0 else np.full(self.n, np.inf))
@@ -476,47 +488,15 @@ class LinearPlant(LimitValues):
         return read_only(Q), read_only(R), read_only(self.of_first_error.covariance(self.n + 2))
 
     @cached_property
-    def grid_rows(self) -> GridRows | None:
-        """What the box says between samples, the same on every machine; None if only the sampling instants count.
-
-        Between two grid points a function leaves its linear interpolation by at most h^2/8 times its largest second
-        derivative, here [c, 0] G^2 exp(G tau) (x, u). In the norm |q|_W = sum |q_j| W_j, with W the largest |x_j| and
-        |u_j|, that grows from one grid point to the next by at most exp(h m), m the logarithmic norm of G.
-
-        Raises:
-            OverflowError: If it is out of reach of float64.
-        """
-        model, points = self.continuous_model, self.between_samples
-        if points is None:
-            return None
-        G, h = np.concatenate([model, np.zeros((self.m, self.n + self.m))]), self.dt / points
-        rows, W = np.pad(self.box, ((0, 0), (0, self.m))), np.concatenate([self._widest(), self.largest_input])
-        try:
-            times = [self.dt * i / points for i in range(1, points)]
-            onward = [rows, *(exact.product(rows, exact.exponential(G, time)) for time in times)]
-            bends = [exact.product(np.abs(exact.product(each, G, G)), W) for each in onward]
-            sizes = [exact.product(np.abs(each), W) for each in onward]
-            growth = float(exact.exponential(np.array([[_logarithmic_norm(G, W)]]), h)[0, 0])
-        except OverflowError as error:
-            raise OverflowError(
-                "the bound between samples is out of reach of float64: a shorter dt or closer limits would help"
-            ) from error
-        remainder = (1.0 + GRID_MARGIN) * (h * h / 8.0) * growth * np.max(bends, axis=0)
-        remainder = remainder + GRID_ROUNDING * np.max(sizes, axis=0)
-        state, applied = np.split(np.array(onward), [self.n], axis=2)
-        return GridRows(read_only(state), read_only(applied), read_only(remainder))
-
-    @cached_property
-    def _rows_within_step(self) -> np.ndarray | None:
-        """Rows on (x, u, x+) that are c x(tau_i), i = 1..N-1, shape ((N - 1) k, 2 n + m); None as of `grid_rows`.
+    def _rows_within_step(self) -> np.ndarray:
+        """Rows on (x, u, x+) that are c x(tau_i), i = 1..N-1, shape ((N - 1) k, 2 n + m).
 
         What a disturbance did has come in proportion to the time: d_tau = (tau / dt) (x+ - A x - B u) is in E(D), too.
         """
-        if (rows := self.grid_rows) is None:
-            return None
-        shares = (np.arange(1, len(rows.state)) / len(rows.state))[:, None, None]
-        moved, pushed = rows.state[1:] - shares * (self.box @ self.A), rows.input[1:] - shares * (self.box @ self.B)
-        return np.concatenate([moved, pushed, shares * self.box], axis=2).reshape(-1, 2 * self.n + self.m)
+        rows = self.step_rows[len(self.mixed_rows) :].reshape(-1, len(self.box), self.n + self.m)
+        shares = (np.arange(1, len(rows) + 1) / (len(rows) + 1))[:, None, None]
+        before = shares * (self.box @ np.hstack([self.A, self.B]))
+        return np.concatenate([rows - before, shares * self.box], axis=2).reshape(-1, 2 * self.n + self.m)
 
     def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
         """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
@@ -524,7 +504,7 @@ class LinearPlant(LimitValues):
         Shape (k + q,) or (k + q, N), for x, x+ of shape (n,) or (n, N) and the input that was held, (m,) or (m, N).
         """
         values, rows = self.constraint_values(x_next), self._rows_within_step
-        if rows is not None:
+        if len(rows):
             reached = rows.dot(np.concatenate([state, u, x_next])).reshape(-1, *values.shape)
             low, high = self.box_ends if values.ndim == 1 else self.box_ends[:, :, None]
             values = np.maximum(np.maximum(reached.max(axis=0) - high, low - reached.min(axis=0)), values)
@@ -545,7 +525,7 @@ class LinearPlant(LimitValues):
         if self.remainder is not None:
             numbers += self.remainder.numbers
         if self.between_samples is not None:
-            numbers += [("between samples", self.between_samples), ("continuous", self.continuous_model)]
+            numbers += [("kept", self.kept_ends), ("step", self.step_rows), ("step ends", self.step_ends)]
         return _digest(numbers)
 
 
@@ -556,15 +536,6 @@ def _digest(numbers: Iterable[tuple[Any, Any]]) -> str:
         array = np.asarray(value, dtype="<f8") + 0.0
         digest.update(f"{name}{array.shape}".encode() + array.tobytes())
     return digest.hexdigest()
-
-
-def _logarithmic_norm(G: np.ndarray, W: np.ndarray) -> float:
-    """Returns m = max_i (G_ii + sum_{j != i} |G_ij| W_j / W_i), at least 0.
-
-    In the norm max |z_j| / W_j of columns, and so in |q|_W of rows, |exp(G s)| <= exp(s m).
-    """
-    off = np.abs(G) * (1.0 - np.eye(len(G)))
-    return max(float((np.diag(G) + exact.product(off, W) / W).max()), 0.0)
 
 
 def row_limit(plant: LinearPlant, j: int) -> str:

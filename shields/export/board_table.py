@@ -170,8 +170,7 @@ def _exported(certificate: Certificate, plant: LinearPlant) -> Updates:
         "it has no polytope: give one of ncs synthesize --safe-set polytope": not is_polytope,
         "it has no channel contract: give one of ncs synthesize --max-age": certificate.updates is None,
         "its plant has a remainder": plant.remainder is not None,
-        "its box counts between samples": plant.grid_rows is not None,
-        "its plant limits states and inputs together": len(plant.mixed_rows) > 0,
+        "its plant limits states and inputs together, or the box between samples": len(plant.step_rows) > 0,
     }
     for reason, holds in reasons.items():
         if holds:

@@ -308,7 +308,7 @@ class GuaranteeMonitor:
     def __init__(self, safety_filter: SafetyFilter, downlink: DownlinkProtocol = IDEAL_DOWNLINK) -> None:
         plant, certificate = safety_filter.plant, safety_filter.certificate
         self._input_delay = downlink.input_delay
-        self._within_step = plant.grid_rows is not None or len(plant.mixed_rows) > 0
+        self._within_step = len(plant.step_rows) > 0
         self._is_promised = downlink.contract is not None
         self._test = safety_filter.test
         # The present estimate, which is not observed then, is near where what was predicted of it is nearer still.

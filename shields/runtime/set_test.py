@@ -1,7 +1,7 @@
 """The test of an input: whether everything that one step can reach with it lies in the set that a certificate keeps.
 
-A set is rows with two ends, a cone, or both: an ellipsoid has no rows, a polytope no cone, and limits within a step
-stand below: of states and inputs together, and of the box at the times of a grid (docs/shield_proof.md).
+A set is rows with two ends, or a cone: an ellipsoid has no rows, a polytope no cone. Limits within a step stand below
+the rows: of states and inputs together, and of the box at other times (docs/shield_proof.md).
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from ncs_gym.validation import frozen, read_only
 from shields.certificate import Certificate, CertificateError
 from shields.polytope import Polytope
 from shields.runtime.projection import closest_admissible, closest_between, closest_in_interval, closest_on_line
-from shields.runtime.rows_within_step import closed, rows_within_step, supports
 from shields.verification import ACTION_ROUNDING
 from shields.verification.polytope_conditions import faces_of
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
@@ -40,6 +39,23 @@ FARTHEST = 1e100
 SMALLEST_RADIUS = 1e-5
 # An error shape may be indefinite by this fraction of its diagonal: rounding of flat ones.
 INDEFINITE = 1e-9
+# An end of a row that is open counts as this far from the other one, in units of the row: a closer end is no less safe,
+# and no set is that wide.
+OPEN = 1e4
+
+
+def supports(rows: np.ndarray, shapes: np.ndarray, rounding: Any) -> np.ndarray:
+    """Returns upper bounds of sqrt(g S g'), shape (..., r), for rows g, (..., r, n), and shapes S, (..., n, n).
+
+    Computing g S g' is off by at most the rounding.
+    """
+    squares = ((rows @ shapes) * rows).sum(axis=-1)
+    return np.sqrt(np.maximum(squares, 0.0) + rounding)
+
+
+def closed(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns finite ends for ends of which one may be open."""
+    return np.where(np.isfinite(low), low, high - OPEN), np.where(np.isfinite(high), high, low + OPEN)
 
 
 class SetTest:
@@ -59,14 +75,14 @@ class SetTest:
 
           low + reach <= g c <= high - reach,    reach = sqrt(g A Sigma_k A' g') + sqrt(g D g'),
 
-      which is exact for what is known: the supports of errors and disturbances add up. The rows on x_hat and u of
-      limits within a step (`rows_within_step`) follow, for either set.
+      which is exact for what is known: the supports of errors and disturbances add up. The plant's `step_rows`, on
+      x_hat and u, follow.
 
     Radius and row limits are reduced, and Sigma_pred enlarged, by a bound on the rounding of all products and of
     simulating the step; where a set has both, by the larger of their bounds.
 
     Args:
-        plant: Gives A, B, D, the limits and the rows within a step.
+        plant: Gives A, B, D and the limits.
         cone: G with |z|_M <= |G z| for S (`certified_root`), shape (n, n); (0, n) for P.
         rows: Those of P, shape (r, n); (0, n) for S.
         low, high: Their ends, shape (r,).
@@ -79,7 +95,7 @@ class SetTest:
         middle, half: Of the ends of the rows, those within a step included: low <= v <= high is |v - middle| <= half,
             which is as fast as one end. The half is less by the rounding of both.
         D: G D G' of the cone with the rounding of computing it, shape (k, k).
-        disturbed: sqrt(g D g') of the rows with the rounding of computing it, and what stands for it within a step.
+        disturbed: sqrt(g D g') of the rows with the rounding of computing it; 0 within a step, whose ends hold it.
         rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
         columns, own_columns: Norms of the columns of |G| |A| and of |G|, of rows their largest entries, shape (n,).
         pushed: Largest norm of |G| |B| |u| within the limits, or its largest entry.
@@ -92,26 +108,26 @@ class SetTest:
         self, plant: LinearPlant, cone: np.ndarray, rows: np.ndarray, low: np.ndarray, high: np.ndarray
     ) -> None:
         self.plant, self.cone, self.limits = plant, len(cone), plant.input_ends.T.tolist()
-        within, self.root = rows_within_step(plant), read_only(np.concatenate([cone, rows]))
-        self.state_rows = read_only(np.concatenate([self.root @ plant.A, within.state]))
-        self.input_rows = read_only(np.concatenate([self.root @ plant.B, within.input]))
+        self.root, (of_state, of_input) = read_only(np.concatenate([cone, rows])), np.hsplit(plant.step_rows, [plant.n])
+        self.state_rows = read_only(np.concatenate([self.root @ plant.A, of_state]))
+        self.input_rows = read_only(np.concatenate([self.root @ plant.B, of_input]))
         self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
-        low, high = closed(np.concatenate([low, within.low]), np.concatenate([high, within.high]))
+        low, high = closed(*np.hstack([[low, high], plant.step_ends]))
         self.middle = read_only(0.5 * (low + high))
         self.half = read_only(0.5 * (high - low) - self.rounding * np.abs(self.middle))
         self.joint = read_only(np.hstack([self.state_rows, self.input_rows])[self.cone :])
         self._limited_rows = read_only(np.concatenate([self.input_rows[self.cone :], np.eye(plant.m)]))
         self._input_range = read_only(plant.input_middle[:, None]), read_only(plant.input_half[:, None])
         size = np.abs(self.root)
-        sizes = np.concatenate([size @ np.abs(plant.A), np.abs(within.state)])
-        pushes = np.concatenate([size @ np.abs(plant.B), np.abs(within.input)])
+        sizes = np.concatenate([size @ np.abs(plant.A), np.abs(of_state)])
+        pushes = np.concatenate([size @ np.abs(plant.B), np.abs(of_input)])
         self.columns, self.own_columns = read_only(self._norms(sizes)), read_only(self._norms(size))
         self.pushed, self.shift = self._largest(pushes), self._largest(np.abs(self.input_rows))
         D = plant.disturbance.shape_matrix
         rounding = self.rounding * float(self.own_columns @ np.sqrt(np.diag(D))) ** 2
         spread = cone @ D @ cone.T + rounding * np.eye(self.cone)
         self.D = read_only(0.5 * (spread + spread.T))
-        self.disturbed = read_only(np.concatenate([supports(rows, D, rounding), within.disturbed]))
+        self.disturbed = read_only(np.pad(supports(rows, D, rounding), (0, len(of_state))))
 
     def _norms(self, sizes: np.ndarray) -> np.ndarray:
         """Returns the norms of the columns in the cone, or their largest entries in the rows if they are larger."""

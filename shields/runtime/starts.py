@@ -16,7 +16,6 @@ from ncs_gym.estimation.kalman_filter import enlarged_by_rounding
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields.certificate import Certificate
 from shields.polytope import Polytope
-from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import MARGIN, SafetyFilter
 from shields.runtime.set_test import PredictedErrors
 from shields.verification.rational_matrix import (
@@ -68,8 +67,8 @@ def starts_in_box(plant: LinearPlant, initial: Ellipsoid | np.ndarray) -> bool:
 
     Where the box counts between samples, they have to lie in a smaller one, in which disturbances cannot leave it.
     """
-    between = rows_within_step(plant)
-    return _between(between.at_samples, between.low_at_samples, between.high_at_samples, initial)
+    low, high = plant.kept_ends
+    return _between(plant.box, low, high, initial)
 
 
 def _between(rows: np.ndarray, low: np.ndarray, high: np.ndarray, initial: Ellipsoid | np.ndarray) -> bool:

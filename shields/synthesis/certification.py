@@ -92,7 +92,7 @@ def synthesize(
     if time_limit is not None:
         as_number(time_limit, "time_limit", low=0.0, low_open=True)
     polytope = safe_set != "ellipsoid"
-    if needs_resting_point(plant) and not polytope:
+    if not (polytope or _may_keep_ellipsoid(plant)):
         raise ValueError(
             "only a polytope is sought where limits are not symmetric, not all states have any, or some are of states "
             "and inputs together"
@@ -116,7 +116,7 @@ def first_certificate(
         Infeasible: If none is found.
         TimeoutError: If the time of the search is over.
     """
-    candidates = [largest_ellipsoid] * (not needs_resting_point(plant)) + [around_resting_point] * polytope
+    candidates = [largest_ellipsoid] * _may_keep_ellipsoid(plant) + [around_resting_point] * polytope
     if 2 * plant.past > plant.n:
         candidates.reverse()
     failure = None
@@ -139,3 +139,7 @@ def first_certificate(
     except np.linalg.LinAlgError as error:
         failure = Infeasible(reason_of(error), "S", 1.0)
     raise with_limits_out_of_proportion(failure, plant)
+
+
+def _may_keep_ellipsoid(plant: LinearPlant) -> bool:
+    return plant.is_symmetric and not needs_resting_point(plant)

@@ -10,7 +10,6 @@ import numpy as np
 
 from ncs_gym import ChannelContract, ErrorSetError, LinearPlant, UnstablePlantError, exact
 from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
-from ncs_gym.plants.linear_plant import GridRows
 from ncs_gym.uncertainty.ellipsoid import is_inside, joined
 from shields.errors import Infeasible
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
@@ -116,7 +115,7 @@ def design_problem(
     The set is sought within `limits`, by default the plant's own.
 
     Raises:
-        Infeasible: If the plant has no error set, or its safe box is flat, or far too wide for times between samples.
+        Infeasible: If the plant has no error set, or its safe box is flat.
     """
     limits = SymmetricLimits(plant.box_rows, plant.u_max) if limits is None else limits
     _, sizes, directions = np.linalg.svd(limits.box_rows * plant.half_widths)
@@ -130,10 +129,6 @@ def design_problem(
             "S",
             flatness,
         )
-    try:
-        _ = plant.grid_rows
-    except OverflowError as error:
-        raise Infeasible(f"(B) {error}", "B", 1.0) from error
     try:
         errors = certified_error_set(plant, contract).larger(INFLATION)
     except UnstablePlantError as error:
@@ -169,13 +164,3 @@ def design_problem(
         rounding=s,
     )
     return problem, errors
-
-
-def taken_between_samples(plant: LinearPlant, grid: GridRows, D: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns what is not left of the box between samples (docs/shield_proof.md, "Between the samples").
-
-    That is eta and the rounding of actions, shape (N, k), and the supports rho of the disturbance E(D), (k,).
-    """
-    rounding = float(ACTION_ROUNDING) * (np.abs(grid.input) @ plant.input_half)
-    squares = np.einsum("ji,ik,jk->j", plant.box, D, plant.box)
-    return grid.remainder + rounding, np.sqrt(np.maximum(squares, 0.0))

@@ -34,7 +34,7 @@ def infeasibility(plant: LinearPlant, tolerated: Tolerated | None, *, polytope: 
         if binding and all(k <= j < k + m for j in binding)
         else f"(I) no invariant {missing} was found"
     )
-    own = k + m + len(plant.mixed_rows)  # rows beyond are those of the box at times within a step
+    own = k + m + len(plant.mixed_rows)  # rows beyond are those of the box at other times of a step
     limits = [row_limit(plant, j if j < own else (j - own) % k) for j in binding]
     named = f" (those that bind: {', '.join(dict.fromkeys(limits))})" if limits else ""
     once = f"a quick search finds one once disturbance and error radii shrink to {100.0 * fraction:.3g}% of those given"

@@ -223,19 +223,16 @@ def share_of_points(feedback: Feedback, plant: LinearPlant, points: np.ndarray) 
 
 
 def limits_within_step(feedback: Feedback, plant: LinearPlant) -> Faces:
-    """Returns what limits within a step ask of x - x_c under the fallback, for all errors and disturbances.
+    """Returns what limits within a step ask of x - x_c under the fallback, for all errors and roundings of inputs.
 
-    First the box less eta at the times of the plant's grid, ordered by time, then by row (docs/shield_proof.md,
-    "Between the samples"); then limits of states and inputs together (the same, "States and inputs together").
+    They are the plant's `step_rows` (docs/shield_proof.md, "States and inputs together").
     """
-    (K, errors, D, rest), mixed = feedback, len(plant.mixed_rows)
-    limits = around(limit_rows(plant, D), rest)
-    order = np.roll(np.arange(len(plant.box) + plant.m, len(limits.rows)), -mixed)
-    state, pushed = np.split(limits.rows[order], [plant.n], axis=1)
-    answer, taken = pushed @ K, limits.disturbed[order]
-    taken[len(order) - mixed :] += float(ACTION_ROUNDING) * (np.abs(plant.mixed_rows[:, plant.n :]) @ plant.input_half)
-    least = taken + np.sqrt(np.maximum(np.einsum("ri,lij,rj->lr", answer, errors, answer), 0.0).max(axis=0))
-    return Faces(state + answer, limits.low[order] + least, limits.high[order] - least)
+    (K, errors, _, rest), k = feedback, len(plant.box) + plant.m
+    rows, low, high = (each[k:] for each in around(limit_rows(plant), rest))
+    state, pushed = np.split(rows, [plant.n], axis=1)
+    answer, taken = pushed @ K, float(ACTION_ROUNDING) * (np.abs(pushed) @ plant.input_half)
+    taken = taken + np.sqrt(np.maximum(np.einsum("ri,lij,rj->lr", answer, errors, answer), 0.0).max(axis=0))
+    return Faces(state + answer, low + taken, high - taken)
 
 
 class _ClosedLoop:
@@ -252,20 +249,17 @@ class _ClosedLoop:
         """Returns the faces of the box, of inputs, and within a step; raises Infeasible if errors alone leave one."""
         plant, (x_c, u_c) = self.plant, self.rest
         reached = plant.box @ x_c
-        box = in_half_ranges(plant.box, *(plant.box_ends - reached))
+        box = in_half_ranges(plant.box, *(plant.kept_ends - reached))
         taken = plant.input_half * (float(ACTION_ROUNDING) + self._margin) + self._reach(self._K)
         low, high = plant.input_ends[0] - u_c + taken, plant.input_ends[1] - u_c - taken
         if ((low >= 0.0) | (high <= 0.0)).any():
             raise _none("the error of the estimate alone takes an input beyond its limit; better sensors leave room")
         inputs, within = in_half_ranges(self._K, low, high), limits_within_step(self._feedback, plant)
         low, high = within.low + self._margin, within.high - self._margin
-        left = (low >= 0.0) | (high <= 0.0)
-        if left[: len(left) - len(plant.mixed_rows)].any():
-            raise _none("errors and disturbances alone leave the box between two samples; smaller bounds leave room")
-        if left.any():
+        if ((low >= 0.0) | (high <= 0.0)).any():
             raise _none(
-                "errors of the estimate alone break a limit of states and inputs together; better sensors, or a gain "
-                "that answers less, leave room"
+                "errors of the estimate alone break a limit within a step; better sensors, or a gain that answers "
+                "less, leave room"
             )
         faces = box.followed_by(inputs).followed_by(in_half_ranges(within.rows, low, high))
         return faces._replace(rows=faces.rows * self.widths)
@@ -292,7 +286,7 @@ class _ClosedLoop:
             np.where(np.isfinite(ends), exact.rounded(np.where(np.isfinite(ends), ends, 0.0), _DIGITS) + reached, ends)
             for ends in (faces.low, faces.high)
         )
-        own = Faces(plant.box, *plant.box_ends)
+        own = Faces(plant.box, *plant.kept_ends)
         return own.followed_by(Faces(rows, low, high).some(slice(count, None)))
 
     def multipliers(self, faces: Faces) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from ncs_gym.plants.linear_plant import inflated, weight_of
 from ncs_gym.plants.lqr import lqr_gain
 from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields.errors import Infeasible
-from shields.synthesis.design_problem import Rest, SymmetricLimits, taken_between_samples
+from shields.synthesis.design_problem import Rest, SymmetricLimits
 
 # Significant digits of a resting point, in units of the limits: what differs between processors is beyond them.
 _DIGITS = 12
@@ -46,31 +46,20 @@ def equilibria(plant: LinearPlant) -> np.ndarray:
 
 
 class LimitRows(NamedTuple):
-    """Limits low <= rows (x, u) <= high, (r, n + m), in units of half their range: of the box, inputs, both together.
-
-    `disturbed` is the support of what has come by then of the disturbance, shape (r,): 0 but between samples.
-    """
+    """Limits low <= rows (x, u) <= high, (r, n + m), in units of half their range: box, inputs, within a step."""
 
     rows: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    disturbed: np.ndarray
 
 
-def limit_rows(plant: LinearPlant, D: np.ndarray | None = None) -> LimitRows:
-    """Returns the limits of a plant, and for disturbances of the shape D, (n, n), those between samples, by time."""
+def limit_rows(plant: LinearPlant) -> LimitRows:
+    """Returns the limits that proofs for a plant keep."""
     box = np.hstack([plant.box, np.zeros((len(plant.box), plant.m))])
     inputs = np.hstack([np.zeros((plant.m, plant.n)), np.diag(1.0 / plant.input_half)])
-    rows = np.concatenate([box, inputs, plant.mixed_rows])
-    ends = np.concatenate([plant.box_ends, plant.input_ends / plant.input_half, plant.mixed_ends], axis=1)
-    disturbed = np.zeros(len(rows))
-    if D is not None and (grid := plant.grid_rows) is not None:
-        taken, by_disturbance = taken_between_samples(plant, grid, D)
-        rows = np.concatenate([rows, np.concatenate([grid.state, grid.input], axis=2).reshape(-1, rows.shape[1])])
-        left = np.tile(plant.box_ends, len(taken)) + np.outer([1.0, -1.0], taken.ravel())
-        ends = np.concatenate([ends, left], axis=1)
-        disturbed = np.concatenate([disturbed, np.tile(by_disturbance, len(taken))])
-    return LimitRows(rows, ends[0], ends[1], disturbed)
+    rows = np.concatenate([box, inputs, plant.step_rows])
+    ends = np.concatenate([plant.kept_ends, plant.input_ends / plant.input_half, plant.step_ends], axis=1)
+    return LimitRows(rows, *ends)
 
 
 def around(limits: LimitRows, rest: Rest) -> LimitRows:
@@ -81,7 +70,8 @@ def around(limits: LimitRows, rest: Rest) -> LimitRows:
 
 def needs_resting_point(plant: LinearPlant) -> bool:
     """Returns whether limits are not symmetric about the operating point, or leave a state free."""
-    return not plant.is_symmetric or exact.rank(plant.box) < plant.n
+    low, high = limit_rows(plant)[1:]
+    return not np.array_equal(-low, high) or exact.rank(plant.box) < plant.n
 
 
 class Farthest(NamedTuple):
@@ -102,7 +92,7 @@ def farthest_equilibrium(
     Raises:
         Infeasible: If no equilibrium is strictly within the limits.
     """
-    directions, (rows, low, high, _) = equilibria(plant), limits or limit_rows(plant)
+    directions, (rows, low, high) = equilibria(plant), limits or limit_rows(plant)
     reached, needed = rows @ directions, np.ones((len(rows), 1)) if needs is None else needs[:, None]
     above, below = np.isfinite(high), np.isfinite(low)
     faces = np.concatenate([np.hstack([reached, needed])[above], np.hstack([-reached, needed])[below]])

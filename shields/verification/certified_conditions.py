@@ -11,7 +11,6 @@ import numpy as np
 from ncs_gym import Ellipsoid, LinearPlant
 from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate, Updates
-from shields.verification.between_samples import between_conditions
 from shields.verification.condition import ACTION_ROUNDING, Condition, flag, matrix_condition, scalar_condition
 from shields.verification.polytope_conditions import polytope_conditions
 from shields.verification.rational_matrix import (
@@ -51,8 +50,6 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> list[C
             conditions += _ellipsoid_conditions(S, certificate, plant)
         else:
             conditions += polytope_conditions(S, certificate, plant)
-        if all(condition.holds for condition in conditions):
-            conditions += between_conditions(certificate, plant)
     return conditions
 
 

@@ -39,14 +39,13 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
     Sigma (BK)' g' for all error sets, and d that of g D g' and what rounding the action does; from below likewise.
     """
     rows, box = polytope.rows, plant.box
-    images = len(rows) + plant.m + len(box) * (plant.between_samples or 0) + len(plant.mixed_rows)
-    fits = polytope.multipliers.shape == (images, len(rows))
+    fits = polytope.multipliers.shape == (len(rows) + plant.m + len(plant.step_rows), len(rows))
     yield flag("polytope: shapes", fits)
     if not fits:
         return
     leads = len(rows) >= len(box) and bool((rows[: len(box)] == box).all())
     ends = polytope.low[: len(box)], polytope.high[: len(box)]
-    leads = leads and bool((np.stack(ends) == plant.box_ends).all())
+    leads = leads and bool((np.stack(ends) == plant.kept_ends).all())
     yield flag("polytope: its first rows are those of the safe box", leads)
     if not leads:
         return
@@ -66,12 +65,12 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
         yield scalar_condition(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
     # (PM): f x + g u = (f + g K) x - g K e around what it is at rest.
     rest = rational(np.concatenate([certificate.resting_state, certificate.resting_input]))
-    for j, row in enumerate(plant.mixed_rows):
+    for j, row in enumerate(plant.step_rows):
         mixed = rational(row)
         image = add([mixed[0][: plant.n]], multiply([mixed[0][plant.n :]], K))[0]
-        ends = ends_from(plant.mixed_ends[:, j], multiply(mixed, transpose(rest))[0][0])
-        left = faces.left_of(image, images - len(plant.mixed_rows) + j, *ends) - reach(mixed[0][plant.n :])
-        yield scalar_condition(f"(PM) limit {j + 1} of states and inputs together holds on the polytope", left)
+        ends = ends_from(plant.step_ends[:, j], multiply(mixed, transpose(rest))[0][0])
+        left = faces.left_of(image, len(rows) + plant.m + j, *ends) - reach(mixed[0][plant.n :])
+        yield scalar_condition(f"(PM) the limit of row {j + 1} within a step holds on the polytope", left)
 
 
 def reach_of_error(certificate: Certificate, plant: LinearPlant) -> Callable[[list[Fraction]], Fraction]:

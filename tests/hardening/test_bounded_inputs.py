@@ -4,7 +4,6 @@ import json
 import os
 import tracemalloc
 from contextlib import contextmanager
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,9 +18,8 @@ from ncs_gym.reading import (
     json_values,
 )
 from shields import Certificate, CertificateError
-from shields.verification.between_samples import between_conditions
-from tests.certificates import certificate_of
 from tests.product import altered, sampled_plant
+from tests.second_verifier.between_samples import row_conditions
 
 pytestmark = pytest.mark.filterwarnings("ignore:the times in")
 
@@ -126,30 +124,14 @@ def stiff(speed, points=64):
     return sampled_plant(model, dt=0.1, box=[1.0, 1.0], u_max=1.0, between_samples=points, **bounds)
 
 
-def grid_conditions(plant):
-    """What is decided of the plant's grid; the certificate is another plant's, which these conditions do not ask."""
-    certificate = replace(certificate_of(truck_trailer(mass=4000.0)), between_samples=plant.between_samples)
-    found = []
-    for condition in between_conditions(certificate, plant):
-        if condition.name.startswith("(B)"):
-            break
-        found.append(condition)
-    return [each for each in found if each.name.startswith("(G)")]
-
-
 @pytest.mark.cases(1)
-@pytest.mark.parametrize(("speed", "holds"), [(300.0, True), (1e5, False)])
-def test_stiff_models_are_decided_in_numbers_of_bounded_length(speed, holds):
-    conditions = grid_conditions(stiff(speed))
-    assert len(conditions) == 2
-    assert all(each.holds for each in conditions) == holds
-
-
-def test_bound_between_grid_points_is_hardly_more_than_it_has_to_be():
-    """The plant's own eta is one percent more than needed, of which the verification leaves most."""
-    plant = stiff(3.0)
-    rows = plant.grid_rows
+@pytest.mark.parametrize("speed", [3.0, 300.0, 1e5])
+def test_rows_of_stiff_models_are_right_and_hardly_closer_than_they_have_to_be(speed):
+    """The plant's own eta is one percent more than needed."""
+    plant = stiff(speed)
+    assert all(each.holds for each in row_conditions(plant))
     other = altered(plant)
-    other.__dict__["grid_rows"] = rows._replace(remainder=0.98 * rows.remainder)
-    assert all(each.holds for each in grid_conditions(plant))
-    assert not all(each.holds for each in grid_conditions(other))
+    kept = other.box_ends + 0.98 * (plant.kept_ends - other.box_ends)
+    object.__setattr__(other, "kept_ends", kept)
+    object.__setattr__(other, "step_ends", np.tile(kept, 63))
+    assert not all(each.holds for each in row_conditions(other))

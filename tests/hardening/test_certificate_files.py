@@ -88,7 +88,7 @@ def forged(content, path):
     """The certificate in a file with a fitting checksum; None if it is refused."""
     text = json.dumps(content)
     literal = json.loads(text, parse_float=str, parse_int=str)
-    path.write_text(json.dumps({"format": "ncs-gym certificate 4", "sha256": digest(literal), "certificate": content}))
+    path.write_text(json.dumps({"format": "ncs-gym certificate 5", "sha256": digest(literal), "certificate": content}))
     return loaded_from(path)
 
 

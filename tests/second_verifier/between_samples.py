@@ -1,4 +1,4 @@
-"""(G), (B) and (PB) of docs/shield_proof.md by the second engine: exponentials and roots as balls."""
+"""(G) of docs/shield_proof.md by another route: what limits at all times of a step ask, with exponentials as balls."""
 
 from __future__ import annotations
 
@@ -8,62 +8,41 @@ from typing import Any
 import numpy as np
 from flint import arb, arb_mat, ctx, fmpq
 
-from ncs_gym import Ellipsoid, LinearPlant
-from shields.certificate import Certificate
+from ncs_gym import LinearPlant
 from shields.verification.condition import Condition
-from tests.second_verifier.exact import (
-    FLOAT32,
-    PRECISION,
-    ball_at_least_zero,
-    form,
-    is_so,
-    mapped,
-    matrix,
-    number,
-    reach_of,
-)
-from tests.second_verifier.polytope import Inside, extents
+from tests.second_verifier.exact import PRECISION, ball_at_least_zero, form, is_so, matrix, number
+from tests.second_verifier.polytope import extents
 
 
-def between_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks what a certificate claims of times between samples, without the code of the first engine."""
-    grid, points = plant.grid_rows, plant.between_samples
-    if points is None and certificate.between_samples is None:
-        return
-    is_claimed = points == certificate.between_samples and grid is not None
-    yield is_so("between samples: the certificate has the plant's grid", is_claimed)
-    if grid is None or plant.continuous_model is None or points is None or not is_claimed:
-        return
-    held = any(number(entry) != 0 for entry in plant.step_offset)
-    yield is_so("between samples: no constant disturbance holds the operating point", not held)
-    (k, n), m, S = plant.box.shape, plant.m, certificate.safe_set
-    kept = (grid.state.shape, grid.input.shape, grid.remainder.shape) == ((points, k, n), (points, k, m), (k,))
-    if kept:
-        first = np.concatenate([grid.state[0] - plant.box, grid.input[0]], axis=1)
-        kept = bool(np.isfinite(grid.remainder).all()) and not np.count_nonzero(first)
-    yield is_so("between samples: the grid has all its points and begins with the safe box", kept)
+def row_conditions(plant: LinearPlant) -> Iterator[Condition]:
+    """Checks that limits at samples and within a step imply those at all times, row by row of the box."""
+    (k, n), m, points, q = plant.box.shape, plant.m, plant.between_samples or 1, len(plant.mixed_rows)
+    fits = plant.step_rows.shape == (q + k * (points - 1), n + m) and plant.kept_ends.shape == (2, k)
+    fits = fits and plant.step_ends[:, q:].tolist() == np.tile(plant.kept_ends, points - 1).tolist()
+    fits = fits and plant.step_rows[:q].tolist() == plant.mixed_rows.tolist()
+    fits = fits and plant.step_ends[:, :q].tolist() == plant.mixed_ends.tolist()
+    yield is_so("rows at all other times, with the ends of those at samples", fits)
     ends = [[number(end) if np.isfinite(end) else None for end in pair] for pair in plant.box_ends.T]
     widths = extents(matrix(plant.box).tolist(), ends, k)
-    yield is_so("between samples: the box bounds every state", widths is not None)
-    if not kept or widths is None:
+    if not fits or widths is None:
         return
     with ctx.workprec(PRECISION):
-        for j, least in enumerate(_remainders(plant, widths + [number(limit) for limit in plant.largest_input])):
-            name = f"(G) what is between grid points is at most eta of row {j + 1}"
-            yield ball_at_least_zero(name, arb(number(grid.remainder[j])) - least)
-        fits = isinstance(S, Ellipsoid) or len(S.multipliers) == len(S.rows) + m + k * points + len(plant.mixed_rows)
-        if fits:
-            yield from _gain_conditions(certificate, plant)
+        needed = _remainders(plant, widths + [number(limit) for limit in plant.largest_input])
+        for j, least in enumerate(needed):
+            rho = arb(form(matrix(plant.box[j]), matrix(plant.disturbance.shape_matrix))).sqrt()
+            for side, (given, kept) in enumerate(zip(plant.box_ends[:, j], plant.kept_ends[:, j], strict=True)):
+                if np.isfinite(given):
+                    taken = (1 - 2 * side) * (number(kept) - number(given))
+                    name = f"(G) end {side} of row {j + 1} is closer by what is between grid points, and by rho"
+                    yield ball_at_least_zero(name, arb(taken) - least - rho)
+                else:
+                    yield is_so(f"end {side} of row {j + 1} is open", kept == given)
 
 
 def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
     """Returns balls around the least eta that is proved for each row of the box, given the largest |x_i| and |u_i|."""
-    grid, model, points = plant.grid_rows, plant.continuous_model, plant.between_samples
-    assert grid is not None
-    assert model is not None
-    assert points is not None
-    (k, _), m, dt = plant.box.shape, plant.m, number(plant.dt)
-    size = len(sizes)
+    model, points, q = plant.model.continuous, plant.between_samples or 1, len(plant.mixed_rows)
+    k, m, dt, size = len(plant.box), plant.m, number(plant.dt), len(sizes)
     G = matrix(np.vstack([model, np.zeros((m, size))]))
     box = matrix(np.hstack([plant.box, np.zeros((k, m))]))
     rates = [
@@ -75,8 +54,10 @@ def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
         true = arb_mat(box) * arb_mat(G * (dt * i / points)).exp()
         if i == points:  # the sampled plant itself
             rows = matrix(plant.box) * matrix(np.hstack([plant.A, plant.B]))
+        elif i:
+            rows = matrix(plant.step_rows[q + (i - 1) * k :][:k])
         else:
-            rows = matrix(np.hstack([grid.state[i], grid.input[i]]))
+            rows = box
         bend = true * arb_mat(G * G)
         for row in range(k):
             off = [abs(true[row, j] - arb(rows[row, j])) * arb(sizes[j]) for j in range(size)]
@@ -86,31 +67,3 @@ def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:
                 bends[row] = bends[row].max(sum(turn, arb(0)))
     square = arb(dt * dt / (8 * points * points))
     return [error + square * growth * bend for error, bend in zip(errors, bends, strict=True)]
-
-
-def _gain_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks (B) of an ellipsoid, (PB) of a polytope."""
-    grid, S, k = plant.grid_rows, certificate.safe_set, len(plant.box)
-    assert grid is not None
-    K, D = matrix(certificate.K), matrix(certificate.D)
-    errors = [mapped(K, matrix(proof.Sigma)) for proof in certificate.proofs]
-    rest = matrix(np.concatenate([certificate.resting_state, certificate.resting_input])).transpose()
-    half = [number(each) for each in plant.input_half]
-    inside = None if isinstance(S, Ellipsoid) else Inside.of(S, k)
-    for i, (state, pushed) in enumerate(zip(grid.state, grid.input, strict=True)):
-        for j in range(k):
-            push = matrix(pushed[j])
-            image = matrix(state[j]) + push * K
-            taken = arb(number(grid.remainder[j]) + FLOAT32 * reach_of(push, half))
-            taken += arb(form(matrix(plant.box[j]), D)).sqrt()
-            taken += arb(max(form(push, error) for error in errors)).sqrt()
-            where = f"tau_{i} of row {j + 1}"
-            if isinstance(S, Ellipsoid):
-                name, reached = f"(B) |c x| + rho <= 1 - eta on S at {where}", form(image, matrix(S.shape_matrix))
-                yield ball_at_least_zero(name, 1 - taken - arb(reached).sqrt())
-            elif inside is not None:
-                at_rest = (matrix(np.concatenate([state[j], pushed[j]])) * rest)[0, 0]
-                ends = [number(end[j]) - at_rest if np.isfinite(end[j]) else None for end in plant.box_ends]
-                which = len(S.rows) + plant.m + i * k + j
-                left = inside.distance(image.tolist()[0], which, *ends) - taken
-                yield ball_at_least_zero(f"(PB) |c x| + rho <= 1 - eta on S at {where}", left)

@@ -12,7 +12,6 @@ from flint import fmpq
 from ncs_gym import Ellipsoid, LinearPlant
 from shields.certificate import Certificate
 from shields.verification.condition import Condition
-from tests.second_verifier.between_samples import between_conditions
 from tests.second_verifier.bounds import bound_conditions
 from tests.second_verifier.exact import (
     FLOAT32,
@@ -53,7 +52,6 @@ def certified_conditions(certificate: Certificate, plant: LinearPlant) -> Iterat
         yield from _ellipsoid_conditions(S, certificate, D, plant)
     else:
         yield from polytope_conditions(S, certificate, plant)
-    yield from between_conditions(certificate, plant)
 
 
 def _fits(certificate: Certificate, plant: LinearPlant) -> bool:

@@ -28,14 +28,14 @@ from tests.second_verifier.exact import (
 def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks (P), (PU) and (PM) without the code of the first engine; what cannot be stated is left out."""
     r, k = len(polytope.rows), len(plant.box)
-    before = r + plant.m + k * (plant.between_samples or 0)
-    fits = polytope.multipliers.shape == (before + len(plant.mixed_ends[0]), r)
+    before = r + plant.m
+    fits = polytope.multipliers.shape == (before + len(plant.step_rows), r)
     yield is_so("polytope: shapes", fits)
     if not fits:
         return
     leads = r >= k and all(a == b for a, b in zip(polytope.rows[:k].ravel(), plant.box.ravel(), strict=True))
-    leads = leads and polytope.low[:k].tolist() == plant.box_ends[0].tolist()
-    leads = leads and polytope.high[:k].tolist() == plant.box_ends[1].tolist()
+    leads = leads and polytope.low[:k].tolist() == plant.kept_ends[0].tolist()
+    leads = leads and polytope.high[:k].tolist() == plant.kept_ends[1].tolist()
     yield is_so("polytope: its first rows are those of the safe box", leads)
     if not leads:
         return
@@ -60,15 +60,15 @@ def polytope_conditions(polytope: Polytope, certificate: Certificate, plant: Lin
             left = inside.distance(gain, r + i, *ends) - arb(FLOAT32 * half[i]) - arb(largest).sqrt()
             yield ball_at_least_zero(f"(PU) input {i + 1} stays within u_max (1 - 2^-24) on the polytope", left)
         at_rest = [*certificate.resting_state, *certificate.resting_input]
-        for i in range(len(plant.mixed_ends[0])):
-            both = matrix(plant.mixed_rows[i]).tolist()[0]
+        for i in range(len(plant.step_rows)):
+            both = matrix(plant.step_rows[i]).tolist()[0]
             state, push = fmpq_mat([both[: plant.n]]), fmpq_mat([both[plant.n :]])
             value = sum((a * number(b) for a, b in zip(both, at_rest, strict=True)), fmpq(0))
-            ends = [number(end[i]) - value if np.isfinite(end[i]) else None for end in plant.mixed_ends]
+            ends = [number(end[i]) - value if np.isfinite(end[i]) else None for end in plant.step_ends]
             left = inside.distance((state + push * K).tolist()[0], before + i, *ends)
             left -= arb(max(form(push, mapped(K, Sigma)) for Sigma in errors)).sqrt()
             left -= arb(FLOAT32 * reach_of(push, half))
-            yield ball_at_least_zero(f"(PM) limit {i + 1} of states and inputs together holds on the polytope", left)
+            yield ball_at_least_zero(f"(PM) the limit of row {i + 1} within a step holds on the polytope", left)
 
 
 class Inside:

@@ -11,7 +11,6 @@ from scipy.optimize import linprog
 from ncs_gym import ChannelContract
 from shields import CertificateError, certificate_for, reach_of, setpoint_range
 from shields.held import held_text
-from shields.runtime.rows_within_step import rows_within_step
 from tests.certificates import certificate_of
 from tests.plants import named
 from tests.product import altered, linear_plant, safety_filter
@@ -107,13 +106,13 @@ def equilibria_at(directions, state, value, rng):
 def test_range_is_that_of_a_linear_program_in_states_and_inputs(name):
     """With states and inputs as variables, the limits of the test, and errors and disturbances by their supports."""
     plant, certificate = certified(name, "polytope")
-    P, within, D = certificate.safe_set, rows_within_step(plant), plant.disturbance.shape_matrix
+    P, D = certificate.safe_set, plant.disturbance.shape_matrix
     for age in ages_of(certificate):
         Sigma = certificate.error_shapes[age]
-        rows = np.vstack([np.hstack([P.rows @ plant.A, P.rows @ plant.B]), np.hstack([within.state, within.input])])
+        rows = np.vstack([np.hstack([P.rows @ plant.A, P.rows @ plant.B]), plant.step_rows])
         kept = np.sqrt(np.einsum("ij,jk,ik->i", rows[:, : plant.n], Sigma, rows[:, : plant.n]))
-        kept = kept + np.concatenate([np.sqrt(np.einsum("ij,jk,ik->i", P.rows, D, P.rows)), within.disturbed])
-        low, high = np.concatenate([P.low, within.low]), np.concatenate([P.high, within.high])
+        kept = kept + np.pad(np.sqrt(np.einsum("ij,jk,ik->i", P.rows, D, P.rows)), (0, len(plant.step_rows)))
+        low, high = np.hstack([[P.low, P.high], plant.step_ends])
         sides = np.vstack([rows, -rows]), np.concatenate([high - kept, -low - kept])
         program = {
             "A_ub": sides[0][np.isfinite(sides[1])],

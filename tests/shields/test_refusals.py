@@ -39,7 +39,7 @@ def synthesized(box, gamma=1e-4):
 def read(**changes):
     """A certificate read from a document with other entries, whose checksum fits."""
     content = json.loads(json.dumps(kept("stable", "polytope").document["certificate"]))
-    return Certificate.read(document_of("certificate", "ncs-gym certificate 4", content | changes))
+    return Certificate.read(document_of("certificate", "ncs-gym certificate 5", content | changes))
 
 
 def read_multipliers(first):
@@ -75,7 +75,7 @@ REFUSED = [
     # Fields of certificates.
     (lambda: replace(kept(), proofs=()), CertificateError, "proofs"),
     (lambda: replace(kept("unstable"), proofs=kept("unstable").proofs[:1]), CertificateError, "must have 2 proofs"),
-    (lambda: replace(kept(), between_samples="8"), CertificateError, "between_samples must be"),
+    (lambda: replace(kept(), updates="8"), CertificateError, "updates must be"),
     (
         lambda: replace(kept("servo", "polytope"), safe_set=Ellipsoid(np.eye(2))),
         CertificateError,

@@ -12,8 +12,7 @@ import numpy as np
 
 from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
-from shields.runtime.rows_within_step import RowsWithinStep, closed, rows_within_step, supports
-from shields.runtime.set_test import SMALLEST_RADIUS, SetTest, ball, judged_shapes
+from shields.runtime.set_test import SMALLEST_RADIUS, SetTest, ball, closed, judged_shapes, supports
 
 # Error shapes whose tightenings are remembered; they recur, since they depend only on what arrived when. Fewer where
 # those of one are many numbers.
@@ -173,9 +172,9 @@ class Prediction:
         plant: The plant.
         steps: N.
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
-            its others. Those of the box are closer where it counts between samples, too (`RowsWithinStep`).
+            its others.
         middle, half: Of the ends of these rows, shape (r,); the half is less by the rounding of both.
-        grid: What is asked between samples.
+        grid: What is asked within steps.
         powers, sizes: A^j and |A|^j for j = 0..N, shape (N + 1, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
         size_forced: sum_{i<j} |A|^i |B| |u| for the largest |u| within the limits, shape (N, n).
@@ -186,11 +185,11 @@ class Prediction:
 
     def __init__(self, first: SetTest, steps: int) -> None:
         plant, n, m = first.plant, first.plant.n, first.plant.m
-        self.plant, self.steps, between = plant, steps, rows_within_step(plant)
+        self.plant, self.steps = plant, steps
         self.cone, ends_in = first.root[: first.cone], first.root[first.cone :]
-        k = len(between.at_samples)
-        self.rows = np.concatenate([between.at_samples, ends_in[k:]])
-        low, high = closed(between.low_at_samples, between.high_at_samples)
+        k = len(plant.box)
+        self.rows = np.concatenate([plant.box, ends_in[k:]])
+        low, high = closed(*plant.kept_ends)
         middle, half = first.middle[k : len(ends_in)], first.half[k : len(ends_in)]
         self.middle = read_only(np.concatenate([0.5 * (low + high), middle]))
         rounding = first.rounding * np.abs(self.middle[:k])
@@ -209,7 +208,7 @@ class Prediction:
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
         self.ends = tuple(End.after(j + 1, self) for j in range(steps)) if first.cone else ()
-        self.grid = PlanGrid(self, between)
+        self.grid = PlanGrid(self)
         self._free = self.powers[1:].reshape(steps * n, n)
         self._forced = self.forced.reshape(steps * n, steps * m)
 
@@ -222,9 +221,7 @@ class Prediction:
 
 
 class PlanGrid:
-    """The rows of the grid in every step of a plan, i = 0..N-1: row (A_tau c_i + B_tau u_i) +- rho_i is between ends.
-
-    There are none, g = 0, where the box counts at samples alone.
+    """The plant's `step_rows` in every step of a plan, i = 0..N-1: row (c_i, u_i) +- rho_i is between its ends.
 
     Attributes:
         free: Rows on x_hat, shape (N, g, n).
@@ -232,33 +229,33 @@ class PlanGrid:
         middle: Of the ends of these rows, shape (g,).
     """
 
-    def __init__(self, prediction: Prediction, test: RowsWithinStep) -> None:
-        steps, m, n = prediction.steps, prediction.plant.m, prediction.plant.n
-        size, self._rounding = np.abs(test.state), prediction.rounding
-        self.free = read_only(test.state @ prediction.powers[:-1])
+    def __init__(self, prediction: Prediction) -> None:
+        plant, steps, m, n = prediction.plant, prediction.steps, prediction.plant.m, prediction.plant.n
+        of_state, of_input = np.hsplit(plant.step_rows, [n])
+        size, self._rounding = np.abs(of_state), prediction.rounding
+        self.free = read_only(of_state @ prediction.powers[:-1])
         self._size = read_only(size @ prediction.sizes[:-1])
-        forced = test.state @ np.concatenate([np.zeros((1, n, steps * m)), prediction.forced[:-1]])
+        forced = of_state @ np.concatenate([np.zeros((1, n, steps * m)), prediction.forced[:-1]])
         for i in range(steps):
-            forced[i, :, i * m : (i + 1) * m] += test.input
+            forced[i, :, i * m : (i + 1) * m] += of_input
         self.forced = read_only(forced)
         pushed = np.concatenate([np.zeros((1, n)), prediction.size_forced[:-1]]) @ size.T
-        self._pushed = read_only(pushed + np.abs(test.input) @ prediction.plant.largest_input)
-        low, high = closed(test.low, test.high)
+        self._pushed = read_only(pushed + np.abs(of_input) @ plant.largest_input)
+        low, high = closed(*plant.step_ends)
         self.middle = read_only(0.5 * (low + high))
         self._half = read_only(0.5 * (high - low) - float(self._rounding[0]) * np.abs(self.middle))
-        D = prediction.plant.disturbance.shape_matrix
+        D = plant.disturbance.shape_matrix
         own = _supports(self.free, self._size, D[None], self._rounding[:, None])[0]
         self._disturbed = read_only(np.concatenate([np.zeros_like(own[:1]), np.cumsum(own[:-1], axis=0)]))
-        self._arriving = test.disturbed
 
     def row_limits(self, shapes: np.ndarray) -> np.ndarray:
         """Returns half the range less rho_i and rounding that is no estimate's, (E, N, g), for shapes (E, n, n)."""
         rounding = self._rounding[:, None]
-        reach = _supports(self.free, self._size, shapes, rounding) + self._disturbed + self._arriving
+        reach = _supports(self.free, self._size, shapes, rounding) + self._disturbed
         return self._half - reach * (1.0 + rounding) - rounding * self._pushed
 
     def keeps(self, estimates: np.ndarray, row_limits: np.ndarray, plans: np.ndarray, margin: float) -> np.ndarray:
-        """Returns whether the box is kept by a margin between the samples of the first i+1 steps, shape (N, E, P)."""
+        """Returns whether limits within the first i+1 steps are kept by a margin, shape (N, E, P)."""
         steps, g, n = self.free.shape
         count, number = plans.shape[:2]
         rounding = np.abs(estimates) @ (self._rounding[:, None, None] * self._size).reshape(-1, n).T

@@ -14,6 +14,7 @@ from scipy.linalg import expm
 from ncs_gym import LinearPlant, cart_pole, truck_trailer
 from ncs_gym.plants.library import batch_reactor
 from tests.product import altered, sampled_plant
+from tests.second_verifier.between_samples import row_conditions
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANTS = {
@@ -40,14 +41,39 @@ def random_model(seed, n, m, k):
 
 
 @pytest.mark.parametrize("name", PLANTS)
-def test_grid_is_that_of_the_model_and_begins_with_the_box(name):
+def test_rows_are_those_of_the_model_with_ends_that_are_closer(name):
     plant = altered(PLANTS[name](), between_samples=6)
-    grid = plant.grid_rows
-    assert not any(array.flags.writeable for array in grid)
-    np.testing.assert_array_equal(grid.state[0], plant.box_rows)
-    assert not grid.input[0].any()
-    true = plant.box_rows @ exponentials(plant, plant.dt * np.arange(6) / 6)
-    np.testing.assert_allclose(np.concatenate([grid.state, grid.input], axis=2), true, rtol=1e-11, atol=1e-13)
+    rows, k = plant.step_rows.reshape(5, len(plant.box), -1), len(plant.box)
+    assert not any(array.flags.writeable for array in (plant.kept_ends, plant.step_rows, plant.step_ends))
+    true = plant.box @ exponentials(plant, plant.dt * np.arange(1, 6) / 6)
+    np.testing.assert_allclose(rows, true, rtol=1e-11, atol=1e-13)
+    np.testing.assert_array_equal(plant.step_ends, np.tile(plant.kept_ends, 5))
+    assert (plant.kept_ends[0] > plant.box_ends[0]).all()
+    assert (plant.kept_ends[1] < plant.box_ends[1]).all()
+    assert all(condition.holds for condition in row_conditions(plant))
+    assert len(list(row_conditions(plant))) == 1 + 2 * k
+
+
+OTHER_ROWS = {
+    "ends of samples": lambda p: {"kept_ends": p.box_ends + 0.95 * (p.kept_ends - p.box_ends)},
+    "ends within": lambda p: {"step_ends": 1.01 * p.step_ends},
+    "a row": lambda p: {"step_rows": p.step_rows * np.where(np.arange(len(p.step_rows)) == 3, 0.98, 1.0)[:, None]},
+    "rows on inputs": lambda p: {"step_rows": np.hstack([p.step_rows[:, : p.n], -p.step_rows[:, p.n :]])},
+    "a time left out": lambda p: {name: getattr(p, name)[..., : -len(p.box), :] for name in ("step_rows",)},
+    "a time twice": lambda p: {"step_rows": np.roll(p.step_rows, len(p.box), axis=0)},
+}
+
+
+@pytest.mark.parametrize("change", OTHER_ROWS.values(), ids=OTHER_ROWS)
+def test_oracle_of_rows_notices_others(change):
+    plant = altered(truck_trailer(mass=4000.0), between_samples=6)
+    changed = change(plant)
+    if "kept_ends" in changed:
+        changed["step_ends"] = np.tile(changed["kept_ends"], 5)
+    for name, value in changed.items():
+        object.__setattr__(plant, name, value)
+    assert not all(condition.holds for condition in row_conditions(plant))
+    assert plant.digest() != altered(truck_trailer(mass=4000.0), between_samples=6).fingerprint
 
 
 @settings(max_examples=12, deadline=None)
@@ -56,13 +82,15 @@ def test_nothing_between_grid_points_is_larger_than_at_them_by_more_than_the_bou
     plant = random_model(seed, n, m, k)
     rng, points, fine = np.random.default_rng(seed), 5, 20
     x = rng.standard_normal((400, n))
-    x /= np.abs(x @ plant.box_rows.T).max(axis=1)[:, None]
-    joint = np.concatenate([x, rng.choice([-1.0, 1.0], (400, m)) * plant.u_max], axis=1)
+    x /= np.abs(x @ plant.box.T).max(axis=1)[:, None]
+    joint = np.concatenate([x, rng.choice([-1.0, 1.0], (400, m)) * plant.largest_input], axis=1)
     moved = exponentials(plant, plant.dt * np.arange(points * fine + 1) / (points * fine))
-    values = np.abs(plant.box_rows @ moved @ joint.T)
+    values = np.abs(plant.box @ moved @ joint.T)
     ends = np.repeat(np.maximum(values[:-fine:fine], values[fine::fine]), fine, axis=0)
     excess = (values[:-1] - ends).max(axis=(0, 2))
-    assert (excess <= plant.grid_rows.remainder).all()
+    rho = np.sqrt(np.diag(plant.box @ plant.disturbance.shape_matrix @ plant.box.T))
+    assert (excess + rho <= plant.box_ends[1] - plant.kept_ends[1]).all()
+    assert all(condition.holds for condition in row_conditions(plant))
 
 
 def test_bound_that_is_out_of_reach_says_so():
@@ -70,15 +98,8 @@ def test_bound_that_is_out_of_reach_says_so():
     model = ([[0.0, 1.0], [-1e7, -2.0]], [[0.0], [2.0]], np.eye(2), np.zeros((2, 1)))
     bounds = {"disturbance_bound": 1e-3, "sensor_bound": 1e-3, "initial_bound": 1e-3}
     box = np.c_[np.cos(angles), np.sin(angles) / 2]
-    plant = sampled_plant(model, 0.1, box=box, u_max=1.0, between_samples=64, **bounds)
-    for asked in (
-        lambda: plant.grid_rows,
-        lambda: plant.worst_constraint_values(np.zeros(2), np.zeros(1), np.zeros(2)),
-    ):
-        with pytest.raises(
-            OverflowError, match="the bound between samples is out of reach of float64: a shorter dt or"
-        ):
-            asked()
+    with pytest.raises(ValueError, match="the bound between samples is out of reach of float64: a shorter dt or"):
+        sampled_plant(model, 0.1, box=box, u_max=1.0, between_samples=64, **bounds)
 
 
 def fine_values(plant, x, u, x_next):
@@ -87,7 +108,7 @@ def fine_values(plant, x, u, x_next):
     shares = np.arange(1, points + 1) / points
     d = x_next - plant.A @ x - plant.B @ u
     states = exponentials(plant, plant.dt * shares) @ np.concatenate([x, u]) + shares[:, None] * d
-    return np.abs(states @ plant.box_rows.T) - 1.0
+    return np.abs(states @ plant.box.T) - 1.0
 
 
 def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
@@ -111,7 +132,7 @@ def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
 
 
 def test_once_per_step_is_at_the_sampling_instants_alone():
-    assert truck_trailer().grid_rows is None
+    assert not len(truck_trailer().step_rows)
     plant = altered(truck_trailer(), between_samples=8)
     assert "at all times: at 8 of each step" in str(plant)
     assert "at all times" not in str(truck_trailer())

@@ -54,8 +54,7 @@ def test_file_gives_back_the_same_plant(name, tmp_path):
         np.testing.assert_array_equal(getattr(twin, bound).shape_matrix, getattr(plant, bound).shape_matrix)
     for array in ("box_ends", "input_ends", "box"):
         np.testing.assert_array_equal(getattr(twin, array), getattr(plant, array))
-    if plant.between_samples:
-        np.testing.assert_array_equal(twin.grid_rows.state, plant.grid_rows.state)
+    np.testing.assert_array_equal(twin.step_rows, plant.step_rows)
     assert twin.document == plant.document == json.loads(json.dumps(plant.document, allow_nan=False))
 
 

@@ -84,7 +84,7 @@ def region_of(safe_set: Any) -> Ball | Faces:
 
 
 def box_of(plant: Any) -> Faces:
-    return Faces(plant.box_rows)
+    return Faces(plant.box)
 
 
 def boundary(region: Ball | Faces, scale: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -99,9 +99,9 @@ class Between:
     def __init__(self, plant: Any) -> None:
         G = np.pad(plant.continuous_model, ((0, plant.m), (0, 0)))
         times = plant.dt * np.arange(FINE + 1) / FINE
-        self.rows = plant.box_rows @ np.array([expm(G * tau)[: plant.n] for tau in times])
+        self.rows = plant.box @ np.array([expm(G * tau)[: plant.n] for tau in times])
         D = plant.nominal_disturbance.shape_matrix
-        self.reach = np.sqrt(np.einsum("ri,ij,rj->r", plant.box_rows, D, plant.box_rows))
+        self.reach = np.sqrt(np.einsum("ri,ij,rj->r", plant.box, D, plant.box))
 
     def gauges(self, states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """Largest |c x(tau)| of steps from states (n, N) with inputs (m, N), shape (N,)."""
@@ -137,7 +137,7 @@ class Adversary:
 
     def proposals(self, estimates: np.ndarray) -> np.ndarray:
         """Inputs, shape (m, N): outwards, anything, always the same, against the certified gain, to and fro."""
-        plant, limits = self.plant, self.plant.u_max[:, None]
+        plant, limits = self.plant, self.plant.largest_input[:, None]
         shape = limits * np.ones((1, self.count))
         away = self.safe.outward(plant.A @ estimates)
         outwards = np.where(plant.B.T @ away < 0.0, -limits, limits)
@@ -181,11 +181,11 @@ class Adversary:
         plant, center, power, spread = self.plant, nominal, np.eye(self.plant.n), 0.0
         if not len(self.plan):
             return self.box.push(nominal, D)
-        least, best = np.inf, plant.box_rows[0]
+        least, best = np.inf, plant.box[0]
         for u in (None, *self.plan):
             if u is not None:
                 center, power = plant.A @ center + plant.B @ u[:, None], plant.A @ power
-            values, pulled = (plant.box_rows @ center)[:, 0], plant.box_rows @ power
+            values, pulled = (plant.box @ center)[:, 0], plant.box @ power
             spread = spread + np.sqrt(np.einsum("ri,ij,rj->r", pulled, D, pulled))
             rooms = 1.0 - np.abs(values) - spread
             if (row := int(rooms.argmin())) >= 0 and rooms[row] < least:

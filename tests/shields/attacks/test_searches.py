@@ -28,7 +28,7 @@ def test_no_search_over_state_error_disturbance_and_proposal_leaves_the_safe_set
         size = numbers[-1]
         x, e, d = (factor @ ball for factor, ball in zip(inside, balls, strict=True))
         errors = shield.errors_of_many(size[:, None, None] ** 2 * certificate.Sigma)
-        u = shield.decide_columns(x + size * e, errors, plant.u_max[:, None] * numbers[3 * n : -1]).input
+        u = shield.decide_columns(x + size * e, errors, plant.largest_input[:, None] * numbers[3 * n : -1]).input
         reached = plant.A @ x + plant.B @ u + d
         return -np.sqrt(np.einsum("ik,ij,jk->k", reached, metric(certificate), reached))
 

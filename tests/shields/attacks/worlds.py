@@ -265,7 +265,7 @@ def through_shield(case: Case, mode: str, network: int, count: int | None, steps
         alarmed = column(info["assumption_violated"])
         watch.compare(estimates, shapes, states, alarmed, step % EPISODE == 0)
         adversary.begin_step(errors, shapes)
-        actions = (adversary.proposals(estimates) / plant.u_max[:, None]).astype(np.float32)
+        actions = (adversary.proposals(estimates) / plant.largest_input[:, None]).astype(np.float32)
         before, episodes = info.get("shield_plan_length", 0), np.array(env.episodes)
         *_, info = shield.step(actions.T if many else actions[:, 0])
         held, ages = column(info["shield_guaranteed"]), column(info["measurement_age"])
@@ -334,7 +334,7 @@ def through_loop(
         rough: By how much disturbances are larger than assumed.
     """
     rng, (uplink, downlink) = np.random.default_rng(seed), case.networks[network % len(case.networks)]
-    plant, certificate, limits = case.plant, case.certificate, case.plant.u_max
+    plant, certificate, limits = case.plant, case.certificate, case.plant.largest_input
     max_age = None if case.contract is None else case.contract.max_age + late
     oldest = 3 if max_age is None else max_age
     delay = 0 if downlink is None else contract_of(downlink).max_age
@@ -397,11 +397,11 @@ def through_estimators(
     error = farthest(plant.initial_error.shape_matrix, adversary.axes)
     many.begin(np.ones(count, np.bool_), error)
     x, samples, seen, outage = np.zeros((plant.n, count)), [], set(), np.zeros(count, np.int64)
-    gain = plant.u_max[:, None] * holding_gain(plant)
+    gain = plant.largest_input[:, None] * holding_gain(plant)
     for step in range(1, steps + 1):
         shapes = many.histories.table.shapes.take(many.statistics, axis=0)
         adversary.begin_step(many.mean - x, shapes)
-        u = gain @ many.mean + 0.05 * rng.uniform(-1.0, 1.0, (plant.m, count)) * plant.u_max[:, None]
+        u = gain @ many.mean + 0.05 * rng.uniform(-1.0, 1.0, (plant.m, count)) * plant.largest_input[:, None]
         nominal = plant.A @ x + plant.B @ u
         x = nominal + adversary.disturbances(nominal, plant.disturbance.shape_matrix)
         y = plant.H @ x + adversary.noise(N)

@@ -8,7 +8,6 @@ import pytest
 from ncs_gym import Ellipsoid
 from shields.polytope import Polytope
 from shields.runtime.backup_plans import PlanTest, Prediction
-from shields.runtime.rows_within_step import rows_within_step
 from shields.runtime.safety_filter import MARGIN
 from shields.runtime.set_test import SMALLEST_RADIUS, ellipsoid_test
 from shields.verification.rational_matrix import multiply, quadratic, rational
@@ -41,7 +40,9 @@ def situations(plant, certificate, rng, count):
     turns = np.linalg.qr(rng.standard_normal((count, plant.n, plant.n)))[0]
     sizes = 10.0 ** rng.uniform(-3, 0, (count, plant.n))
     shapes = factor @ (turns * (0.7 * sizes)[:, None]) @ turns.swapaxes(1, 2) @ factor.T
-    plans = rng.uniform(-1, 1, (count, 1, STEPS, plant.m)) * plant.u_max * rng.uniform(0.2, 1.0, (count, 1, 1, 1))
+    plans = (
+        rng.uniform(-1, 1, (count, 1, STEPS, plant.m)) * plant.largest_input * rng.uniform(0.2, 1.0, (count, 1, 1, 1))
+    )
     return estimates, 0.5 * (shapes + shapes.swapaxes(1, 2)), plans
 
 
@@ -67,15 +68,15 @@ def extreme_ends(plant, x_hat, shape, plan, directions, step):
 
 def farthest_out_of_box(plant, x_hat, shape, plan, step):
     """The largest |c x_{step+1}|."""
-    both = np.concatenate([plant.box_rows, -plant.box_rows])
-    return np.abs(extreme_ends(plant, x_hat, shape, plan, both, step) @ plant.box_rows.T).max()
+    both = np.concatenate([plant.box, -plant.box])
+    return np.abs(extreme_ends(plant, x_hat, shape, plan, both, step) @ plant.box.T).max()
 
 
 def test_what_may_not_begin_a_plan_begins_none_of_many(case):
     plant, certificate, test = case
     rng = np.random.default_rng(5)
     estimates, shapes, plans = situations(plant, certificate, rng, 300)
-    others = plant.u_max * rng.choice([-1.0, 0.0, 1.0], (300, 40, STEPS, plant.m))
+    others = plant.largest_input * rng.choice([-1.0, 0.0, 1.0], (300, 40, STEPS, plant.m))
     others[:, :, 0] = plans[:, :, 0]
     tightening = test.tightenings_of(shapes)
     certified = test.certified(estimates, tightening, np.concatenate([plans, others], axis=1))
@@ -102,7 +103,7 @@ def test_tightenings_are_what_extreme_errors_and_disturbances_attain(case):
 @pytest.mark.parametrize("name", ["cruise, at all times", "reactor, at all times"])
 def test_tightenings_between_samples_are_what_extreme_errors_and_disturbances_attain(name):
     known = attacked_case(name)
-    plant, rows = known.plant, rows_within_step(known.plant)
+    plant, rows = known.plant, known.plant.step_rows[:, : known.plant.n]
     test = PlanTest(Prediction(safety_filter(known.certificate, plant).test, STEPS), MARGIN)
     estimates, shapes, plans = situations(plant, known.certificate, np.random.default_rng(0), 4)
     for x_hat, shape, (plan,), limits in zip(
@@ -110,9 +111,9 @@ def test_tightenings_between_samples_are_what_extreme_errors_and_disturbances_at
     ):
         nominal = [x_hat, *states(plant, x_hat, plan, np.zeros((STEPS, plant.n)))]
         for step in range(STEPS):
-            ends = extreme_ends(plant, x_hat, shape, plan, rows.state, step - 1)  # of no input for the first
-            reached = (rows.state * (ends - nominal[step])).sum(axis=1) + rows.disturbed
-            np.testing.assert_allclose(1.0 - limits[step], reached, rtol=1e-6, atol=1e-9)
+            ends = extreme_ends(plant, x_hat, shape, plan, rows, step - 1)  # of no input for the first
+            reached = (rows * (ends - nominal[step])).sum(axis=1)
+            np.testing.assert_allclose(plant.step_ends[1] - limits[step], reached, rtol=1e-6, atol=1e-9)
 
 
 def largest_level(plant, certificate, x_hat, shape, plan, step, rng):
@@ -172,7 +173,7 @@ def test_inputs_beyond_their_limits_are_not_certified(case):
     plant, certificate, test = case
     estimate, shape = np.zeros((1, plant.n)), 1e-6 * certificate.Sigma[None]
     plan = np.zeros((1, 1, STEPS, plant.m))
-    plan[0, 0, 2, 0] = np.nextafter(plant.u_max[0], np.inf)
+    plan[0, 0, 2, 0] = np.nextafter(plant.largest_input[0], np.inf)
     certified = test.certified(estimate, test.tightenings_of(shape), plan)[0, 0]
     assert not certified[2:].any()
     assert certified[:2].any()
@@ -225,7 +226,7 @@ def test_plans_are_certified_in_rational_arithmetic_where_large_inputs_cancel(wh
             return test.certified(start[None], known, plan[None, None])[0, 0, -1]
 
         passes(edge_of(passes, 1e-5))
-        levels.append(exact_reach(plant, plant.box_rows[0], start, nothing, plan[:step]))
+        levels.append(exact_reach(plant, plant.box[0], start, nothing, plan[:step]))
     assert 1.0 - margin - 1e-6 < min(levels) <= max(levels) <= 1.0 - margin
 
 

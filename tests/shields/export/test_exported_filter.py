@@ -139,7 +139,7 @@ def attacked(folder, name, steps, seed=0, count=200, outages=False):
     worst, seen_reasons = 0.0, set()
     for episode in range(steps // (EPISODE * count)):
         seen = {each: getattr(plant, each) for each in ("A", "B", "H", "n", "m", "half_widths")}
-        seen = SimpleNamespace(**seen, box_rows=plant.box, u_max=plant.largest_input)
+        seen = SimpleNamespace(**seen, box=plant.box, largest_input=plant.largest_input)
         adversary, traffic = (
             Adversary(seen, certificate, rng, count),
             Traffic(*((3 * h, None) if outages else (h, h)), count),
@@ -292,7 +292,7 @@ def test_what_the_board_does_not_know_is_refused():
         "made for another plant": (certificate, example("Convoy")[0]),
         "it has no polytope": (certificate_of(plant, certificate.contract), plant),
         "its plant limits states and inputs together": example("coupled")[::-1],
-        "its box counts between samples": (Certificate.load(CHECKED_IN / "oscillator.json"), oscillator()),
+        "or the box between samples": (Certificate.load(CHECKED_IN / "oscillator.json"), oscillator()),
     }
     for words, refused in given.items():
         with pytest.raises(CertificateError, match=words):

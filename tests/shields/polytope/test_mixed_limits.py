@@ -118,5 +118,4 @@ def test_limits_count_beside_times_between_samples():
     found = certificate_of(plant, CONTRACT, "polytope")
     assert verified(found, plant).valid
     names = [condition.name[:4] for condition in verify(found, plant).conditions]
-    assert names.count("(PM)") == 1
-    assert names.count("(PB)") == 4 * len(plant.box)
+    assert names.count("(PM)") == 1 + 3 * len(plant.box)

@@ -29,7 +29,6 @@ CASES = {
     "polytope": ("stable", "polytope"),
     "polytope, contract": ("unstable", "polytope"),
     "polytope alone": ("servo", "polytope"),
-    "between samples, ellipsoid": ("oscillator", "ellipsoid"),
     "between samples": ("oscillator", "polytope"),
     "between samples, polytope alone": ("servo, at all times", "polytope"),
     "remainder": ("remainder", "polytope"),
@@ -50,7 +49,7 @@ def content_of(certificate):
 
 
 def read(content):
-    return Certificate.read(document_of("certificate", "ncs-gym certificate 4", content))
+    return Certificate.read(document_of("certificate", "ncs-gym certificate 5", content))
 
 
 def numbers_of(content):
@@ -201,7 +200,8 @@ def elsewhere(certificate):
 
 
 def with_polytope(certificate, **changes):
-    changes = dict.fromkeys(("lower_multipliers", "low", "high", "center")) | changes  # of one that is symmetric
+    ends = ("low", "high", "center") if certificate.safe_set.is_symmetric else ()
+    changes = dict.fromkeys(("lower_multipliers", *ends)) | changes
     return replace(certificate, safe_set=replace(certificate.safe_set, **changes))
 
 
@@ -217,17 +217,12 @@ def one_entry(array, where, factor):
     return changed
 
 
-def with_grid(plant, **fields):
-    """The plant as it would be if it had computed other rows between samples."""
-    return replaced(plant, grid_rows=plant.grid_rows._replace(**fields))
-
-
 def every_proof(certificate, **changes):
     return replace(certificate, proofs=tuple(replace(proof, **changes) for proof in certificate.proofs))
 
 
-def between_rows(certificate, change):
-    """The certificate with other multipliers of the times between samples: those after its rows and inputs."""
+def step_rows(certificate, change):
+    """The certificate with other multipliers of limits within a step: those after its rows and inputs."""
     first = len(certificate.safe_set.rows) + len(certificate.K)
     kept, others = np.split(certificate.safe_set.multipliers, [first])
     return with_polytope(certificate, multipliers=np.concatenate([kept, change(others)]))
@@ -263,11 +258,8 @@ OF_CERTIFICATE = [
     ("remainder", "polytope: its first rows", lambda c: with_polytope(c, rows=one_entry(c.safe_set.rows, 0, 1 - 1e-9))),
     ("polytope alone", "(P)", lambda c: with_polytope(c, multipliers=one_entry(c.safe_set.multipliers, -2, 0.9))),
     ("polytope", "(PU) input 1", lambda c: with_polytope(c, multipliers=one_entry(c.safe_set.multipliers, -1, 1e3))),
-    ("between samples", "between samples: the certificate", lambda c: replace(c, between_samples=None)),
-    ("between samples, ellipsoid", "between samples: the certificate", lambda c: replace(c, between_samples=4)),
-    ("ellipsoid", "between samples: the certificate", lambda c: replace(c, between_samples=3)),
-    ("between samples", "polytope: shapes", lambda c: between_rows(c, lambda others: others[:-2])),
-    ("between samples", "(PB)", lambda c: between_rows(c, lambda others: 0.0 * others)),
+    ("between samples", "polytope: shapes", lambda c: step_rows(c, lambda others: others[:-2])),
+    ("between samples", "(PM)", lambda c: step_rows(c, lambda others: 0.0 * others)),
 ]
 # or what a plant derives,
 OF_PLANT = [
@@ -282,35 +274,9 @@ OF_PLANT = [
     ("remainder", "r0:", lambda p: replaced(p, initial_bound=larger(p.initial_bound, 1.001))),
     ("between samples", "D: the plant's", lambda p: replaced(p, disturbance_bound=larger(p.disturbance_bound, 1.001))),
     ("between samples", "N:", lambda p: replaced(p, sensor_bound=larger(p.sensor_bound, 1.001))),
-    ("between samples", "between samples: no constant", lambda p: replaced(p, step_offset=np.array([0.0, 1e-9]))),
-    ("between samples, ellipsoid", "(B)", lambda p: with_grid(p, remainder=0.5 + p.grid_rows.remainder)),
-    ("between samples, ellipsoid", "(G)", lambda p: with_grid(p, state=one_entry(p.grid_rows.state, (2, 0, 0), 0.98))),
-    ("between samples, ellipsoid", "(G)", lambda p: with_grid(p, input=one_entry(p.grid_rows.input, (2, 1, 0), 0.9))),
-    ("between samples, ellipsoid", "(G)", lambda p: with_grid(p, remainder=0.95 * p.grid_rows.remainder)),
-    ("between samples, ellipsoid", "(G)", lambda p: with_grid(p, input=-p.grid_rows.input)),
-    (
-        "between samples, ellipsoid",
-        "(G)",
-        lambda p: with_grid(p, **{n: getattr(p.grid_rows, n)[[0, 1, 1]] for n in ("state", "input")}),
-    ),
-    (
-        "between samples",
-        "between samples: the grid",
-        lambda p: with_grid(p, state=one_entry(p.grid_rows.state, (0, 0, 0), 1 - 1e-9)),
-    ),
-    ("between samples", "between samples: the grid", lambda p: with_grid(p, remainder=np.nan * p.grid_rows.remainder)),
-    (
-        "between samples",
-        "between samples: the grid",
-        lambda p: with_grid(p, state=p.grid_rows.state[:-1], input=p.grid_rows.input[:-1]),
-    ),
-    (
-        "between samples",
-        "between samples: the grid",
-        lambda p: with_grid(
-            p, state=p.grid_rows.state[:, 1:], input=p.grid_rows.input[:, 1:], remainder=p.grid_rows.remainder[1:]
-        ),
-    ),
+    ("between samples", "polytope: its first rows", lambda p: replaced(p, kept_ends=(1 - 1e-9) * p.kept_ends)),
+    ("between samples", "(PM)", lambda p: replaced(p, step_ends=p.step_ends * [1.0, 1.0, 0.5, 1.0])),
+    ("between samples", "polytope: shapes", lambda p: replaced(p, step_rows=p.step_rows[:-1])),
 ]
 # or one of them by a number of the other.
 OF_BOTH = [
@@ -370,5 +336,5 @@ def test_changed_part_is_noticed_by_the_right_conditions(name, conditions, chang
 def test_every_condition_has_been_broken(name):
     marks = [condition for _, condition, _ in ALONE] + [mark for _, marks, _ in TOGETHER for mark in marks]
     names = [condition.name for condition in verified(*case(name)).conditions]
-    never = ("polytope: it bounds every state", "between samples: the box bounds every state")  # a plant has one
+    never = ("polytope: it bounds every state",)  # a plant has one
     assert [each for each in names if not each.startswith((*marks, *never))] == []

@@ -56,9 +56,9 @@ def test_file_that_says_something_unknown_is_refused(promised, change, tmp_path)
     _, certificate = promised
     content = certificate.document["certificate"]
     path = tmp_path / "c.json"
-    write_document(path, document_of("certificate", "ncs-gym certificate 4", content))
+    write_document(path, document_of("certificate", "ncs-gym certificate 5", content))
     assert Certificate.load(path) == certificate
     change(content)
-    write_document(path, document_of("certificate", "ncs-gym certificate 4", content))
+    write_document(path, document_of("certificate", "ncs-gym certificate 5", content))
     with pytest.raises(CertificateError, match="wrong kind"):
         Certificate.load(path)
