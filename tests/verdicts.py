@@ -64,7 +64,7 @@ def assert_true(certificate: Certificate, plant: LinearPlant) -> None:
 
     def reach(rows: np.ndarray) -> np.ndarray:
         return (
-            support(S.shape_matrix, rows) if isinstance(S, Ellipsoid) else np.abs(rows @ corners_of(S.rows).T).max(-1)
+            support(S.shape_matrix, rows) if isinstance(S, Ellipsoid) else np.abs(rows @ corners_of(S.F).T).max(-1)
         )
 
     assert (reach(a) > 0.0).all()
@@ -106,4 +106,4 @@ def between(plant: LinearPlant, points: int) -> list[np.ndarray]:
     if not points:
         return []
     G = np.concatenate([plant.continuous_model, np.zeros((plant.m, plant.n + plant.m))])
-    return [plant.box_rows @ expm(G * (plant.dt * i / points))[: plant.n] for i in range(1, points)]
+    return [plant.box @ expm(G * (plant.dt * i / points))[: plant.n] for i in range(1, points)]

@@ -29,8 +29,6 @@ MOST_INPUTS_WITH_VERTICES = 12
 LARGEST_BLOCK = 100_000
 # Entries of an array that are worked on together: as many as a processor keeps near.
 BLOCK = 32_768
-# Projections onto either of two sets of inputs, in turn.
-ALTERNATIONS = 8
 # Growths of the root that are tried until it provably does not understate the norm of S.
 ROOT_GROWTHS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
 # An estimate this far out, in units of S, is not worth a test (and its square overflows at 1e154).
@@ -79,22 +77,21 @@ class SetTest:
       x_hat and u, follow.
 
     Radius and row limits are reduced, and Sigma_pred enlarged, by a bound on the rounding of all products and of
-    simulating the step; where a set has both, by the larger of their bounds.
+    simulating the step.
 
     Args:
-        plant: Gives A, B, D and the limits.
-        cone: G with |z|_M <= |G z| for S (`certified_root`), shape (n, n); (0, n) for P.
-        rows: Those of P, shape (r, n); (0, n) for S.
-        low, high: Their ends, shape (r,).
+        plant: Gives A, B, D and the limits; symmetric ones without any within a step for S.
+        root: G with |z|_M <= |G z| for S (`certified_root`), shape (n, n), or the rows of P, shape (r, n).
+        ends: Low and high ends of the rows of P, shape (2, r); None for S.
 
     Attributes:
-        cone: k, the number of rows at the top of the arrays below that are coordinates of the cone.
-        root: Of the cone and of P, shape (k + r, n).
-        state_rows, input_rows: These times A and B, and then the rows within a step, shapes (.., n) and (.., m).
-        joint: Both beside each other, without the cone.
+        cone: n for S, 0 for P.
+        root: As given.
+        state_rows, input_rows: The root times A and B, and then the rows within a step, shapes (.., n) and (.., m).
+        joint: Both beside each other.
         middle, half: Of the ends of the rows, those within a step included: low <= v <= high is |v - middle| <= half,
             which is as fast as one end. The half is less by the rounding of both.
-        D: G D G' of the cone with the rounding of computing it, shape (k, k).
+        D: G D G' with the rounding of computing it.
         disturbed: sqrt(g D g') of the rows with the rounding of computing it; 0 within a step, whose ends hold it.
         rounding: Bound on the rounding of a product with G, relative to the product of absolute values.
         columns, own_columns: Norms of the columns of |G| |A| and of |G|, of rows their largest entries, shape (n,).
@@ -104,19 +101,18 @@ class SetTest:
         limits: The low and the high end of each input.
     """
 
-    def __init__(
-        self, plant: LinearPlant, cone: np.ndarray, rows: np.ndarray, low: np.ndarray, high: np.ndarray
-    ) -> None:
-        self.plant, self.cone, self.limits = plant, len(cone), plant.input_ends.T.tolist()
-        self.root, (of_state, of_input) = read_only(np.concatenate([cone, rows])), np.hsplit(plant.step_rows, [plant.n])
+    def __init__(self, plant: LinearPlant, root: np.ndarray, ends: np.ndarray | None = None) -> None:
+        self.plant, self.root, self.limits = plant, read_only(root), plant.input_ends.T.tolist()
+        self.cone, of_rows = (len(root), np.empty((2, 0))) if ends is None else (0, ends)
+        of_state, of_input = np.hsplit(plant.step_rows, [plant.n])
         self.state_rows = read_only(np.concatenate([self.root @ plant.A, of_state]))
         self.input_rows = read_only(np.concatenate([self.root @ plant.B, of_input]))
         self.rounding = 8.0 * (plant.n + plant.m) * float(np.finfo(float).eps)
-        low, high = closed(*np.hstack([[low, high], plant.step_ends]))
+        low, high = closed(*np.hstack([of_rows, plant.step_ends]))
         self.middle = read_only(0.5 * (low + high))
         self.half = read_only(0.5 * (high - low) - self.rounding * np.abs(self.middle))
-        self.joint = read_only(np.hstack([self.state_rows, self.input_rows])[self.cone :])
-        self._limited_rows = read_only(np.concatenate([self.input_rows[self.cone :], np.eye(plant.m)]))
+        self.joint = read_only(np.hstack([self.state_rows, self.input_rows]))
+        self._limited_rows = read_only(np.concatenate([self.input_rows, np.eye(plant.m)]))
         self._input_range = read_only(plant.input_middle[:, None]), read_only(plant.input_half[:, None])
         size = np.abs(self.root)
         sizes = np.concatenate([size @ np.abs(plant.A), np.abs(of_state)])
@@ -125,20 +121,20 @@ class SetTest:
         self.pushed, self.shift = self._largest(pushes), self._largest(np.abs(self.input_rows))
         D = plant.disturbance.shape_matrix
         rounding = self.rounding * float(self.own_columns @ np.sqrt(np.diag(D))) ** 2
-        spread = cone @ D @ cone.T + rounding * np.eye(self.cone)
+        spread = root @ D @ root.T + rounding * np.eye(len(root))
         self.D = read_only(0.5 * (spread + spread.T))
-        self.disturbed = read_only(np.pad(supports(rows, D, rounding), (0, len(of_state))))
+        reach = supports(root, D, rounding) if ends is not None else np.empty(0)
+        self.disturbed = read_only(np.pad(reach, (0, len(of_state))))
 
     def _norms(self, sizes: np.ndarray) -> np.ndarray:
-        """Returns the norms of the columns in the cone, or their largest entries in the rows if they are larger."""
-        cone, rows = sizes[: self.cone], sizes[self.cone :]
-        return np.maximum(np.linalg.norm(cone, axis=0), rows.max(axis=0, initial=0.0))
+        """Returns the norms of the columns in a cone, their largest entries in rows."""
+        columns: np.ndarray = np.linalg.norm(sizes, axis=0) if self.cone else sizes.max(axis=0)
+        return columns
 
     def _largest(self, pushes: np.ndarray) -> float:
         """Returns the same of the products with inputs within the limits."""
-        cone, rows = pushes[: self.cone], pushes[self.cone :]
         limits = self.plant.largest_input
-        return max(float(np.linalg.norm(cone, axis=0) @ limits), float((rows @ limits).max(initial=0.0)))
+        return float(np.linalg.norm(pushes, axis=0) @ limits if self.cone else (pushes @ limits).max())
 
     def predicted(self, shapes: np.ndarray, certified_shapes: np.ndarray) -> PredictedErrors:
         """Returns what the test and the guarantee need of error shapes (docs/shield_proof.md, "One step").
@@ -184,7 +180,7 @@ class SetTest:
         small = radius < SMALLEST_RADIUS
         if np.count_nonzero(small):  # too small for the weights: nothing passes
             radius[small] = np.minimum(radius[small], 0.0)
-        center = self.state_rows[: self.cone] @ estimates
+        center = self.state_rows[: self.cone] @ estimates  # none of rows
         return ReachableSets(self, estimates, center, errors.weighting, errors.row_limits, rounding, radius)
 
     def margins_alone(self, estimate: np.ndarray, errors: PredictedErrors, u: np.ndarray) -> tuple[float, float]:
@@ -194,31 +190,25 @@ class SetTest:
         if not radius >= SMALLEST_RADIUS:  # neither NaN
             return nan, nan
         center = self.state_rows.dot(estimate) + self.input_rows.dot(u)
-        least = np.inf
-        if len(self.disturbed):
-            left = errors.row_limits - rounding - np.abs(center[self.cone :] - self.middle)
-            least = left.item(left.argmin())  # NaN if one is, as min() would say, in half the time
         if not self.cone:
+            left = errors.row_limits - rounding - np.abs(center - self.middle)
+            least = left.item(left.argmin())  # NaN if one is, as min() would say, in half the time
             return least, least
-        center = center[: self.cone]
         weighted = errors.weighting.dot(center)
-        margins = radius - float(weighted.dot(weighted)) ** 0.5, radius - float(center.dot(center)) ** 0.5
-        return min(margins[0], least), min(margins[1], least)
+        return radius - float(weighted.dot(weighted)) ** 0.5, radius - float(center.dot(center)) ** 0.5
 
     def closest_alone(self, estimate: np.ndarray, errors: PredictedErrors, u: float, margin: float) -> float:
         """Returns `ReachableSets.closest` of one estimate, shape (n,), and error shape, for plants with one input."""
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
-        center, effect = self.state_rows.dot(estimate), self.input_rows
+        center = self.state_rows.dot(estimate)
         if self.cone:
-            pushed, offset = (errors.weighting.dot(each[: self.cone]) for each in (effect[:, 0], center))
+            pushed, offset = (errors.weighting.dot(each) for each in (self.input_rows[:, 0], center))
             form = (float(pushed.dot(pushed)), float(pushed.dot(offset)), float(offset.dot(offset)))
-            u = closest_on_line(u, *form, errors.radius - rounding - margin, self.limits[0][1])
-        if len(self.disturbed):
-            middle, half = self.plant.input_middle.item(), self.plant.input_half.item()
-            offset = [*(center[self.cone :] - self.middle).tolist(), -middle]
-            limits = [*(errors.row_limits - rounding - margin).tolist(), half]
-            u = closest_in_interval(u, offset, self._limited_rows[:, 0].tolist(), limits)
-        return u
+            return closest_on_line(u, *form, errors.radius - rounding - margin, self.limits[0][1])
+        middle, half = self.plant.input_middle.item(), self.plant.input_half.item()
+        offset = [*(center - self.middle).tolist(), -middle]
+        limits = [*(errors.row_limits - rounding - margin).tolist(), half]
+        return closest_in_interval(u, offset, self._limited_rows[:, 0].tolist(), limits)
 
     def closest_on_rows(self, inputs: np.ndarray, offset: np.ndarray, row_limits: np.ndarray) -> np.ndarray:
         """Returns the inputs within the limits closest to given ones, (m, N), with |offset + rows u| <= row_limits."""
@@ -284,17 +274,12 @@ class ReachableSets(NamedTuple):
 
     def margins(self, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns test and reported margins of inputs u, shape (m, N); shape (N,), NaN where nothing is known."""
-        test = self.test
-        if not test.cone:
+        if not self.test.cone:
             least = self._least_of_rows(inputs)
             return least, least.copy()
-        effect = test.input_rows[: test.cone]  # with a single input, products without the sums are the same and faster
+        effect = self.test.input_rows  # with a single input, products without the sums are the same and faster
         center = self.center + (effect * inputs if len(inputs) == 1 else effect @ inputs)
-        margins = self.radius - norms((self.weighting * center).sum(axis=1)), self.radius - norms(center)
-        if not len(test.joint):
-            return margins
-        least = self._least_of_rows(inputs)
-        return np.minimum(margins[0], least), np.minimum(margins[1], least)
+        return self.radius - norms((self.weighting * center).sum(axis=1)), self.radius - norms(center)
 
     def _least_of_rows(self, inputs: np.ndarray) -> np.ndarray:
         """Returns the least that inputs u, shape (m, N), leave of a row limit, shape (N,)."""
@@ -312,42 +297,31 @@ class ReachableSets(NamedTuple):
 
     def smallest_test_margin(self) -> np.ndarray:
         """Returns that of the worst input within the limits, shape (N,); in the cone a vertex: the norm is convex."""
-        test, cone, plant = self.test, self.test.cone, self.test.plant
-        shift = test.input_rows[cone:] @ plant.input_middle - test.middle
-        center = np.abs(test.state_rows[cone:] @ self.estimates + shift[:, None])
-        pushed = np.abs(test.input_rows[cone:]) @ plant.input_half
-        worst = (self.row_limits - center - pushed[:, None]).min(axis=0, initial=np.inf) - self.rounding
-        if not cone:
+        test, plant = self.test, self.test.plant
+        if not test.cone:
+            shift = test.input_rows @ plant.input_middle - test.middle
+            center = np.abs(test.state_rows @ self.estimates + shift[:, None])
+            pushed = np.abs(test.input_rows) @ plant.input_half
+            worst: np.ndarray = (self.row_limits - center - pushed[:, None]).min(axis=0) - self.rounding
             return worst
-        vertices = np.array(list(product(*test.limits))).T
+        vertices, worst = np.array(list(product(*test.limits))).T, np.full(len(self.radius), np.inf)
         pieces = max(1, vertices.shape[1] * len(self.radius) // LARGEST_BLOCK)
         for some in np.array_split(vertices, pieces, axis=1):
-            centers = self.center[:, None] + (test.input_rows[:cone] @ some)[:, :, None]
+            centers = self.center[:, None] + (test.input_rows @ some)[:, :, None]
             farthest = norms((self.weighting[:, :, None] * centers).sum(axis=1)).max(axis=0)
             worst = np.minimum(worst, self.radius - farthest)
         return worst
 
     def closest(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        """Returns the inputs within the limits, (m, N), closest to given ones with this test margin, else NaN.
-
-        With cone and rows a single input is in two intervals, and the closest point of one to the closest of the other
-        is that of both. Of several inputs projections alternate: the caller tests the result.
-        """
-        cone, rows = self.test.cone, len(self.test.joint)
-        for _ in range(ALTERNATIONS if cone and rows and len(inputs) > 1 else 1):
-            inputs = self._closest_in_cone(inputs, margin) if cone else inputs
-            inputs = self._closest_on_rows(inputs, margin) if rows else inputs
-        return inputs
-
-    def _closest_in_cone(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        effect = self.test.input_rows[: self.test.cone]
-        effect = (self.weighting[:, :, None] * effect[:, :, None]).sum(axis=1)
+        """Returns the inputs within the limits, (m, N), closest to given ones with this test margin, else NaN."""
+        if not self.test.cone:
+            return self._closest_on_rows(inputs, margin)
+        effect = (self.weighting[:, :, None] * self.test.input_rows[:, :, None]).sum(axis=1)
         offset = (self.weighting * self.center).sum(axis=1)
         return closest_admissible(inputs, offset, effect, self.radius - margin, self.test.plant.u_max)
 
     def _closest_on_rows(self, inputs: np.ndarray, margin: float) -> np.ndarray:
-        test, closest = self.test, np.empty(inputs.shape)
-        rows = test.state_rows[test.cone :]
+        test, rows, closest = self.test, self.test.state_rows, np.empty(inputs.shape)
         block = max(1, BLOCK // len(rows))
         for start in range(0, inputs.shape[1], block):
             part = slice(start, start + block)
@@ -487,13 +461,13 @@ def certificate_test(certificate: Certificate, plant: LinearPlant) -> SetTest:
     """
     S = certificate.safe_set
     if isinstance(S, Polytope):
-        return SetTest(plant, np.empty((0, plant.n)), S.rows, S.low, S.high)
+        return SetTest(plant, S.rows, np.array([S.low, S.high]))
     return ellipsoid_test(S.shape_matrix, plant)
 
 
 def ellipsoid_test(L: np.ndarray, plant: LinearPlant) -> SetTest:
     """Returns the test of S = E(L); raises CertificateError as `certificate_test` does."""
-    return SetTest(plant, certified_root(L), np.empty((0, plant.n)), np.empty(0), np.empty(0))
+    return SetTest(plant, certified_root(L))
 
 
 def certified_root(L: np.ndarray) -> np.ndarray:
