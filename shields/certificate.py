@@ -26,8 +26,6 @@ from shields.errors import CertificateError
 from shields.polytope import Polytope, polytope_content, polytope_of
 
 _FORMAT = "ncs-gym certificate 5"
-# What is claimed unless the certificate says more.
-_AT_SAMPLES = "at the sampling instants; nothing is claimed of the times between them"
 # Parts of a point that are smaller than this share of the set are shown as zero.
 _DUST = 1e-9
 # Fields of a `Proof` with an ellipsoid, and those of `Updates` that are arrays.
@@ -258,7 +256,7 @@ class Certificate(ReadOnlyArrays):
         rows = [
             ("plant", f"{counted(n, 'state')}, {counted(m, 'input')}, fingerprint {self.fingerprint[:16]}"),
             ("safe set", safe_set),
-            ("claim", f"in the safe box {recorded.get('claim', _AT_SAMPLES)}"),
+            ("claim", "in the safe box at the sampling instants, and between them only where it says so below"),
             ("size", size_of(recorded)),
             ("fallback", fallback),
             ("contract", contract_text(self.contract)),

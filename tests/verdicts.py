@@ -63,9 +63,7 @@ def assert_true(certificate: Certificate, plant: LinearPlant) -> None:
     rows = a if isinstance(S, Ellipsoid) else S.rows
 
     def reach(rows: np.ndarray) -> np.ndarray:
-        return (
-            support(S.shape_matrix, rows) if isinstance(S, Ellipsoid) else np.abs(rows @ corners_of(S.F).T).max(-1)
-        )
+        return support(S.shape_matrix, rows) if isinstance(S, Ellipsoid) else np.abs(rows @ corners_of(S.F).T).max(-1)
 
     assert (reach(a) > 0.0).all()
     errors = np.max([support(gain @ Sigma @ gain.T, rows) for Sigma in certificate.error_shapes], axis=0)

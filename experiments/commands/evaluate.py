@@ -37,7 +37,6 @@ class EvaluateSettings:
         episodes: Number of evaluation episodes.
         seed: Seed of the episodes.
         certificate: Certificate file to use instead of that of the training, or of synthesizing one.
-        between_samples: Times per step at which the safe box counts; by default the plant's own.
         channel: Changes of the channel that the agent was trained with, by the names that `ncs compare` lists.
         out: File for the summary (JSON).
     """
@@ -49,7 +48,6 @@ class EvaluateSettings:
     episodes: int = 200
     seed: int = 0
     certificate: Path | None = None
-    between_samples: int | None = None
     channel: Assignments = field(default_factory=dict)
     out: Path | None = None
 
@@ -66,8 +64,6 @@ def evaluate(settings: EvaluateSettings) -> None:
         registered_env(settings.env)
     agent, folder = agent_named(str(settings.model), settings.env and id_alone(settings.env))
     loop = LoopConfig(env=agent.env, kwargs=agent.env_kwargs)
-    if settings.between_samples is not None:
-        loop = loop.with_kwargs(between_samples=settings.between_samples)
     loop = with_channel(loop, settings.channel)
     chosen = agent.shield_mode if settings.shield == "as-trained" else settings.shield
     mode = None if chosen == "none" else chosen

@@ -123,6 +123,8 @@ _NUMBERS = (
     *("A", "B", "H", "dt", "box", "box_ends", "input_ends", "mixed_rows", "mixed_ends"),
     *("operating_state", "operating_input", "step_offset"),
 )
+# In their place stands what proofs keep.
+_KEPT = {"box_ends": "kept_ends", "mixed_rows": "step_rows", "mixed_ends": "step_ends"}
 _FORMAT = "ncs-gym plant 2"
 _VALUES: dict[str, type] = {"model": Model, "limits": Limits, "bounds": Bounds}
 
@@ -299,8 +301,6 @@ class LinearPlant(LimitValues):
         if longest := int(self.model.delays.max()):
             up_to = "up to " if np.ptp(self.model.delays) else ""
             lines["input limits"].append(f"inputs take effect {up_to}{counted(longest, 'step')} later")
-        if self.between_samples is not None:
-            lines["safe box"].append(f"at all times: at {self.between_samples} of each step, and bounded between them")
         own = self.n - self.past  # past inputs are known, and their rows limit nothing: inputs have limits
         states = self.state_names[:own], self.state_units[:own]
         outputs = of_outputs(self.H, self.state_names), of_outputs(self.H, self.state_units, "")
@@ -334,7 +334,9 @@ class LinearPlant(LimitValues):
         if self.remainder is not None:
             assumed.append(self.remainder.sentence)
         if self.between_samples is not None:
-            assumed.append("What disturbances have done by any time within a step respects the bound of a whole step.")
+            times = f"at {self.between_samples} of each step, and bounded between them"
+            own = "what disturbances have done by any time within a step respects the bound of a whole step"
+            assumed.append(f"The safe box counts at all times, {times}: {own}.")
         return tuple(assumed)
 
     def __repr__(self) -> str:
@@ -517,15 +519,13 @@ class LinearPlant(LimitValues):
 
     def digest(self) -> str:
         """Returns what the fingerprint would be if it were computed now."""
-        numbers: list[tuple[Any, Any]] = [(name, getattr(self, name)) for name in _NUMBERS]
+        numbers: list[tuple[Any, Any]] = [(name, getattr(self, _KEPT.get(name, name))) for name in _NUMBERS]
         for number, (ball, noise, bound) in enumerate((self.of_disturbance, self.of_sensor, self.of_first_error)):
             shape = None if bound is None or not bound.shape_matrix.any() else bound.shape_matrix
             energy = noise.energy if noise.covariance.any() else 0.0
             numbers += [(f"set {number}", part) for part in (ball, noise.covariance, energy, shape) if part is not None]
         if self.remainder is not None:
             numbers += self.remainder.numbers
-        if self.between_samples is not None:
-            numbers += [("kept", self.kept_ends), ("step", self.step_rows), ("step ends", self.step_ends)]
         return _digest(numbers)
 
 

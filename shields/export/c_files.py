@@ -72,8 +72,9 @@ def _listed(parts: list[tuple[str, np.ndarray]], suffix: str) -> str:
 
 def _vectors(table: BoardTable, plant: LinearPlant, certificate: Certificate) -> Iterator[str]:
     """Yields lines of a simulation: samples late, lost and out of order, in some episodes also what breaks a proof."""
-    rng, h, contract = np.random.default_rng(0), len(table.limit) - 1, certificate.contract
-    channel = Channel(quantization_step=0.0 if contract is None else contract.quantization_step)
+    rng, h, updates = np.random.default_rng(0), len(table.limit) - 1, certificate.updates
+    assert updates is not None  # or it is not exported
+    channel = Channel(quantization_step=updates.contract.quantization_step)
     for episode in range(VECTOR_STEPS // EPISODE_STEPS):
         x = certificate.resting_state
         first = x + plant.nominal_initial_error.sample_boundary(rng)

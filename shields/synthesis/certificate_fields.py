@@ -72,8 +72,6 @@ def fields_of_plant(plant: LinearPlant, errors: ErrorSet) -> dict[str, Any]:
     """Returns the fields of a certificate that set and gain have no part in, with how it was made."""
     solver = f"Clarabel {version('clarabel')} through cvxpy {version('cvxpy')}"
     known: dict[str, Any] = {"source": "docs/shield_proof.md", "solver": solver}
-    if plant.between_samples is not None:
-        known["claim"] = f"at all times ({plant.between_samples} of each step, and a bound on what is between them)"
     return {
         "updates": _updates(errors),
         "fingerprint": plant.fingerprint,

@@ -187,6 +187,7 @@ def _verified_polytope(certificate: Certificate, polytope: Polytope, plant: Line
     report = verify(certificate, plant)
     if not report.valid:
         raise failed_verification(report)
-    if (share := share_in_polytope(polytope, plant)) is None:
+    share = share_in_polytope(polytope, plant)
+    if share is None:
         return certificate.recording(reach_recorded(polytope, plant))
     return certificate.recording({"share_of_box": float(exact.rounded(share, 3))})

@@ -134,7 +134,7 @@ def test_environment_reports_the_worst_value_of_a_step_and_counts_it():
 def test_once_per_step_is_at_the_sampling_instants_alone():
     assert not len(truck_trailer().step_rows)
     plant = altered(truck_trailer(), between_samples=8)
-    assert "at all times: at 8 of each step" in str(plant)
+    assert "at all times, at 8 of each step" in " ".join(str(plant).split())
     assert "at all times" not in str(truck_trailer())
     assert altered(plant, between_samples=1).between_samples is None
 
