@@ -172,7 +172,7 @@ def measure(
 
 
 def replicate(
-    tasks: Annotated[Sequence[str], some_of(TASKS)] = NETWORK_TASKS,
+    tasks: Annotated[Sequence[str], some_of(TASKS)] = TASKS,
     block: int = 2,
     jobs: int = 2,
     out: Path = MEASURED.parent,
