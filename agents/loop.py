@@ -15,7 +15,7 @@ from ncs_gym import Channel
 from ncs_gym.envs.json_settings import from_json, read_plant, to_json
 from ncs_gym.validation import AroundEnvironments, as_number, shown
 from shields import Certificate, SafetyShield, VectorSafetyShield
-from shields.runtime.guarantee import LostGuarantee
+from shields.runtime.guard import LostGuarantee
 from shields.runtime.safety_filter import plan_horizon
 
 

@@ -51,6 +51,7 @@ from ncs_gym import (
     VectorRequestActions,
     cart_pole,
 )
+from ncs_gym.ellipsoid import truncation_energy
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, histories_of
 from ncs_gym.estimation.estimator import Estimator
@@ -58,7 +59,6 @@ from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.network.downlink import CommittedInputs
 from ncs_gym.plants.library import batch_reactor
 from ncs_gym.registration import registered_ids
-from ncs_gym.uncertainty.ellipsoid import truncation_energy
 from shields import Certificate, SafetyShield, VectorSafetyShield, certificate_for, synthesize
 from shields.paper.bounds import with_noise
 from shields.synthesis.tolerance import most_tolerated

@@ -31,10 +31,10 @@ from ncs_gym import (
     NCSVectorEnv,
     Packet,
 )
+from ncs_gym.ellipsoid import outer_sum
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.registration import EPISODE_STEPS
-from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields import SafeLoop, SafetyFilter, SafetyShield, VectorSafetyShield, certificate_for, synthesize
 from shields.export import BoardFilter, BoardTable
 from shields.export.board_filter import GUARANTEED

@@ -1,6 +1,13 @@
 """Imperfect networks around any Gymnasium environment, and plants behind them; importing registers the ids."""
 
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, Through
+from ncs_gym.disturbances import (
+    AdversarialDisturbance,
+    BoxDisturbance,
+    Disturbance,
+    SinusoidDisturbance,
+)
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.episode_channels import RandomChannel, VectorRandomChannel
 from ncs_gym.envs.request_actions import RequestActions, VectorRequestActions
@@ -8,8 +15,15 @@ from ncs_gym.envs.vector_env import NCSVectorEnv
 from ncs_gym.estimation.error_bound import ErrorSetError, UnstablePlantError
 from ncs_gym.limits import Limits
 from ncs_gym.model import Model
-from ncs_gym.network.channel import Channel, GilbertElliott, Packet, TraceChannel
-from ncs_gym.network.contract import BrokenContractWarning, ChannelContract, contract_of
+from ncs_gym.network.channel import (
+    BrokenContractWarning,
+    Channel,
+    ChannelContract,
+    GilbertElliott,
+    Packet,
+    TraceChannel,
+    contract_of,
+)
 from ncs_gym.network.downlink import Actuator, Echo
 from ncs_gym.network.packet_log import PacketLog
 from ncs_gym.networked import Networked, VectorNetworked
@@ -22,13 +36,6 @@ from ncs_gym.processes.process import FunctionProcess
 from ncs_gym.recording import bounds_from_recording
 from ncs_gym.registration import register_all, register_plant
 from ncs_gym.tasks import Regulation, SetpointTracking, SpeedTracking, Task
-from ncs_gym.uncertainty.disturbances import (
-    AdversarialDisturbance,
-    BoxDisturbance,
-    Disturbance,
-    SinusoidDisturbance,
-)
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 
 __version__ = "0.1.0"
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.uncertainty.ellipsoid import (
+from ncs_gym.ellipsoid import (
     SMALLEST_DELTA,
     SMALLEST_KEPT,
     Ellipsoid,

@@ -13,11 +13,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ncs_gym.disturbances import BallDisturbance, BoxDisturbance, Disturbance, SinusoidDisturbance
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.json_settings import JSON_SETTINGS, from_json, read_plant, to_json
 from ncs_gym.envs.vector_env import NCSVectorEnv
-from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.channel import Channel, ChannelContract, contract_of
 from ncs_gym.plants.library import batch_reactor, cart_pole, convoy, lane_keeping, stirred_tank, truck_trailer
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_pole
@@ -25,8 +26,6 @@ from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess, inverted_pendulum
 from ncs_gym.processes.process import Process
 from ncs_gym.tasks import Regulation, SetpointTracking, SpeedTracking, Task
-from ncs_gym.uncertainty.disturbances import BallDisturbance, BoxDisturbance, Disturbance, SinusoidDisturbance
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count
 
 # Steps per episode of every registered environment (Liu et al. Section 5).

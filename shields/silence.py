@@ -133,7 +133,7 @@ class _Fallbacks:
     def __init__(self, certificate: Certificate, plant: LinearPlant) -> None:
         rest, n, k = certificate.fallback, plant.n, len(plant.box)
         limits = around(limit_rows(plant), Rest(rest.resting_state, rest.resting_input))
-        self._rows_on_states = k  # within which S is known to lie
+        self._rows_on_states, self._has_ways = k, len(plant.step_rows) > 0
         self._low, self._high = limits.low, limits.high
         self._own = MARGIN * np.minimum(np.abs(self._low), np.abs(self._high))
         self._on_state, self._on_input = limits.rows[:, :n], limits.rows[:, n:]
@@ -158,7 +158,9 @@ class _Fallbacks:
 
         The state is in S or, if a share is given, its estimate in that share of S.
         """
-        if not self._keeps(age, 0, share)[self._rows_on_states :].all():
+        # S is in the box, but with a share it is not known that the state is in S.
+        first = 0 if share is not None and self._has_ways else self._rows_on_states
+        if not self._keeps(age, 0, share)[first:].all():
             return 0
         for steps in range(1, most + 1):
             kept = self._keeps(age, steps, share)

@@ -18,9 +18,9 @@ import numpy as np
 import ncs_gym
 import shields
 from ncs_gym import Ball, Bounds, Box, Ellipsoid, Gaussian, Limits, LinearPlant, Model, Sum, Through
-from ncs_gym.envs.belief import Belief
+from ncs_gym.ellipsoid import UncertainSet
+from ncs_gym.estimation.estimator import Belief
 from ncs_gym.plants import family as families
-from ncs_gym.uncertainty.ellipsoid import UncertainSet
 from ncs_gym.validation import as_setting
 from shields.runtime.set_test import PredictedErrors
 

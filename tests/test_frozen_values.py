@@ -15,6 +15,7 @@ import pytest
 
 import ncs_gym
 import shields
+from ncs_gym.disturbances import BallDisturbance, SphereDisturbance, as_disturbance
 from ncs_gym.envs.loop import Loop
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.plants.library import batch_reactor
@@ -24,7 +25,6 @@ from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
 from ncs_gym.processes.process import FamilyProcess, LinearProcess
 from ncs_gym.registration import TRUCK_TRAILER
 from ncs_gym.rendering.episode_record import Annotation
-from ncs_gym.uncertainty.disturbances import BallDisturbance, SphereDisturbance, as_disturbance
 from ncs_gym.validation import ReadOnlyArrays
 from shields import setpoint_range
 from shields.export.board_table import BoardTable

@@ -16,8 +16,7 @@ from experiments.runs.loops import registered_env
 from experiments.runs.output_folder import require_place, write_json
 from experiments.terminal import text_table, wrapped
 from ncs_gym import LinearPlant, PacketLog
-from ncs_gym.network.channel import in_time
-from ncs_gym.network.contract import MAX_AGE
+from ncs_gym.network.channel import MAX_AGE, in_time
 from ncs_gym.validation import counted
 from shields import Certificate, silence_of
 from shields.packaged_certificates import certificate_of_package

@@ -26,7 +26,7 @@ from experiments.paper.counterexample import (
 )
 from experiments.paper.late_packets import STARTS, STEPS, discarded, largest_error, replayed, taken_as_current
 from experiments.paper.paper_example import PaperExample
-from ncs_gym.uncertainty.ellipsoid import truncation_energy
+from ncs_gym.ellipsoid import truncation_energy
 from shields.paper.bounds import PaperBounds, PaperModel, safety_margin
 from shields.paper.feasibility import FeasibilityScan, largest_scale
 from shields.paper.optimization_problem import OptimizationProblem

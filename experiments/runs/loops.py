@@ -16,7 +16,7 @@ from agents.loop import LoopConfig
 from experiments.settings import id_alone
 from ncs_gym import Channel, ChannelContract, GilbertElliott, LinearPlant, NCSEnv
 from ncs_gym.envs.env import ncs_env
-from ncs_gym.network.contract import contract_of
+from ncs_gym.network.channel import contract_of
 from ncs_gym.registration import needing_extras, registered_ids
 from ncs_gym.validation import warn_caller
 from shields import Certificate, certificate_for

@@ -9,18 +9,16 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box
 
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.envs.guarded_loop import GuardedLoop
 from ncs_gym.envs.json_settings import SpecOfJson
 from ncs_gym.envs.loop import Loop, OneLoop
 from ncs_gym.envs.loop_settings import expect, require_suitable, start_option
 from ncs_gym.envs.spaces import Observer, observation_space, read_action, read_observed
-from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.channel import Channel, ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
-from ncs_gym.rendering import Annotation, Renderer, sent_at
 from ncs_gym.tasks import Regulation, Task
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_count, as_flag, setting, shown
 
 # The steps the observation space is sized for are gone through one by one.
@@ -195,7 +193,11 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
-        self.renderer = None if render_mode is None else Renderer(plant, self._task, render_mode, RENDER_FPS)
+        self.renderer = None
+        if render_mode is not None:
+            from ncs_gym.rendering import Renderer  # imported here: others draw nothing
+
+            self.renderer = Renderer(plant, self._task, render_mode, RENDER_FPS)
         self._now = OneLoop(loop)
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)
@@ -240,7 +242,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
             info |= guard.info()
         self._consistent, self._over = True, False
         if self.renderer is not None:
-            self.renderer.begin(info, self._task_state, note_of(guard, info))
+            self.renderer.begin(info, self._task_state, guard)
         observation = self._observation()
         if guard is not None:
             guard.lost.tell()
@@ -277,8 +279,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         truncated = process.truncated
         self._consistent, self._over = True, terminated or truncated
         if self.renderer is not None:
-            sent = sent_at(now.steps, now.network, now.received)
-            self.renderer.record(info, self._task_state, sent, note_of(guard, info))
+            self.renderer.record(info, self._task_state, now, guard)
         observation = self._observation()
         if guard is not None:
             guard.lost.tell()
@@ -319,22 +320,6 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         for u in self._now.downlink.committed.pending:
             task_state = self._task.predict_one(self.plant, task_state, u)
         return self._observer.observation(self._belief, self._task.observe(task_state))
-
-
-def note_of(guard: Any, info: dict[str, Any]) -> Annotation | None:
-    """Returns what the picture of the last step shows of a guard, given its info; None without a guard."""
-    if guard is None:
-        return None
-    judge = guard.filter
-    return Annotation(
-        safe_set=judge.certificate.safe_set,
-        label=judge.mode,
-        proposed=info["input_proposed"] if info["episode_steps"] > 0 else None,
-        intervened=bool(info["shield_intervened"]),
-        interventions=int(info["episode_interventions"]),
-        protects=judge.mode != "monitor",
-        plan=guard.stored.copy() if judge.mode == "lookahead" else None,
-    )
 
 
 def ncs_env(env: gym.Env) -> NCSEnv:

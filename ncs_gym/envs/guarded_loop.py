@@ -6,17 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.envs.belief import Belief
+from ncs_gym.disturbances import Disturbance
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.envs.episode_channels import EpisodeChannels
 from ncs_gym.envs.loop import Loop, LoopState
 from ncs_gym.estimation.error_bound import ErrorSet
-from ncs_gym.network.channel import Channel, require_on_request
-from ncs_gym.network.contract import ChannelContract, largest_age
+from ncs_gym.estimation.estimator import Belief
+from ncs_gym.network.channel import Channel, ChannelContract, largest_age, require_on_request
 from ncs_gym.network.downlink import DownlinkProtocol
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
-from ncs_gym.uncertainty.disturbances import Disturbance
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import setting
 
 

@@ -13,22 +13,21 @@ from weakref import WeakValueDictionary
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from ncs_gym.network.channel import Channel, GilbertElliott, TraceChannel
-from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.processes.cart_pole_process import CartPoleProcess
-from ncs_gym.processes.gym_pendulum import PendulumProcess
-from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
-from ncs_gym.processes.process import FamilyProcess, LinearProcess
-from ncs_gym.tasks import TASKS
-from ncs_gym.uncertainty.disturbances import (
+from ncs_gym.disturbances import (
     AdversarialDisturbance,
     BallDisturbance,
     BoxDisturbance,
     SinusoidDisturbance,
     SphereDisturbance,
 )
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
+from ncs_gym.ellipsoid import Ellipsoid
+from ncs_gym.network.channel import Channel, ChannelContract, GilbertElliott, TraceChannel
+from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.processes.cart_pole_process import CartPoleProcess
+from ncs_gym.processes.gym_pendulum import PendulumProcess
+from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
+from ncs_gym.processes.process import FamilyProcess, LinearProcess
+from ncs_gym.tasks import TASKS
 from ncs_gym.validation import shown
 
 # What a dictionary of fields stands for in these settings; several classes are told apart by the names of their fields.

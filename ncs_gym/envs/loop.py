@@ -9,23 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.envs.belief import Belief
+from ncs_gym.disturbances import Disturbance, as_disturbance, as_noise
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.envs.episode_channels import covering, downlinks, uplinks
 from ncs_gym.envs.loop_settings import expect, loop_contracts, starting_set
 from ncs_gym.envs.spaces import nearest_action
 from ncs_gym.estimation.arrival_histories import ArrivalHistories, arrival_histories
 from ncs_gym.estimation.error_bound import ErrorSet
-from ncs_gym.estimation.estimator import Estimator, VectorEstimator
-from ncs_gym.network.channel import Channel, UnusedPacketsWarning
-from ncs_gym.network.contract import ChannelContract, largest_age
+from ncs_gym.estimation.estimator import Belief, Estimator, VectorEstimator
+from ncs_gym.network.channel import Channel, ChannelContract, UnusedPacketsWarning, largest_age
 from ncs_gym.network.downlink import DownlinkProtocol, DownlinkState, Inputs, VectorDownlinkState, no_inputs
 from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
 from ncs_gym.network.requests import Requests
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.plant_step import PlantSimulation
 from ncs_gym.processes.process import LinearProcess, Process, as_process, own_process
-from ncs_gym.uncertainty.disturbances import Disturbance, as_disturbance, as_noise
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import CopiedWhole, as_flag, frozen, warn_caller
 
 # Keeps the rounding of a sampled start inside the initial set.

@@ -7,13 +7,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ncs_gym import exact
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.estimation.error_bound import UnstablePlantError
-from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.channel import Channel, ChannelContract, contract_of
 from ncs_gym.network.downlink import DownlinkProtocol, downlink_protocol
 from ncs_gym.plants.linear_plant import LinearPlant, weight_of
 from ncs_gym.tasks import Task
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, as_vector, shown
 
 T = TypeVar("T")

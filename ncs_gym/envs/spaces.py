@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 
-from ncs_gym.envs.belief import Belief
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.estimation.error_bound import ErrorSet
+from ncs_gym.estimation.estimator import Belief
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.tasks import Task
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import as_numbers, counted, shown, warn_caller
 
 # What can be observed besides estimate and task.

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ncs_gym.ellipsoid import common_axes, quick_test
 from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
-from ncs_gym.estimation.innovation import common_axes, quick_test
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
-from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.channel import Channel, ChannelContract
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import frozen
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import exact
-from ncs_gym.network.contract import ChannelContract
-from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH, LinearPlant
+from ncs_gym.ellipsoid import INFLATION, SMALLEST_MULTIPLIER, is_inside, joined, outer_sum, rounded_up
+from ncs_gym.network.channel import ChannelContract
+from ncs_gym.plants.linear_plant import SIMULATED_REACH, LinearPlant
 from ncs_gym.plants.lqr import regulator_gain
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside, joined, outer_sum, rounded_up
 from ncs_gym.validation import ReadOnlyArrays
 
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ncs_gym.ellipsoid import FLAT_INFLATION, INFLATION, is_inside, outer_sum
 from ncs_gym.estimation.error_bound import ErrorSet
-from ncs_gym.plants.linear_plant import FLAT_INFLATION, INFLATION, LinearPlant
-from ncs_gym.uncertainty.ellipsoid import is_inside, outer_sum
+from ncs_gym.plants.linear_plant import LinearPlant
 
 # Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `enlarged_by_rounding`).
 ROUNDING = 1e-13

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import MAX_AGE, ChannelContract, contract_of, largest_age
+from ncs_gym.network.channel import MAX_AGE, Channel, ChannelContract, contract_of, largest_age
 from ncs_gym.network.packet_loss_and_delay import ChannelState, VectorChannelState
 from ncs_gym.validation import (
     CopiedWhole,

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ncs_gym.network.channel import Channel
-from ncs_gym.network.contract import ChannelContract, largest_age
+from ncs_gym.network.channel import Channel, ChannelContract, largest_age
 from ncs_gym.validation import shown
 
 

@@ -15,8 +15,7 @@ from gymnasium.wrappers import Autoreset
 
 from ncs_gym.envs.episode_channels import EpisodeChannels
 from ncs_gym.envs.json_settings import from_json, to_json
-from ncs_gym.network.channel import LONGEST_DELAY, Channel, TraceChannel
-from ncs_gym.network.contract import contract_of, largest_age
+from ncs_gym.network.channel import LONGEST_DELAY, Channel, TraceChannel, contract_of, largest_age
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.validation import as_count, as_numbers, counted, setting, shown, warn_caller
 

@@ -17,7 +17,7 @@ _MARGIN, _ROUNDING = 0.01, 1e-12
 
 
 def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
-    """Returns `kept_ends`, `step_rows` and `step_ends` of a plant whose box counts at N times of each step.
+    """Returns `kept_ends`, `arriving`, `step_rows` and `step_ends` of a plant whose box counts at N times of each step.
 
     With the input held, x(tau) = A_tau x + B_tau u + d_tau, where [A_tau, B_tau] is the upper part of exp(G tau) for
     G = [[Ac, Bc], [0, 0]]. A row c of the box is one on (x, u) at the times tau_i = i dt / N, of which the first is on
@@ -27,7 +27,7 @@ def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
     |u_j|, that grows from one time to the next by at most exp(h m), m the logarithmic norm of G.
 
     Raises:
-        ValueError: If the bound is out of reach of float64.
+        ValueError: If the bound is out of reach of float64, or leaves nothing of a limit.
     """
     points, n, m = plant.limits.between_samples or 1, plant.n, plant.m
     G, h = np.concatenate([plant.model.continuous, np.zeros((m, n + m))]), plant.dt / points
@@ -48,8 +48,16 @@ def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
     eta = (1.0 + _MARGIN) * (h * h / 8.0) * growth * np.max(bends, axis=0) + _ROUNDING * np.max(sizes, axis=0)
     rho = np.sqrt(np.diag(exact.product(plant.box, D, plant.box.T)))
     kept_ends = plant.box_ends + np.outer([1.0, -1.0], (1.0 + _ROUNDING) * (eta + rho))
+    if (emptied := np.flatnonzero(kept_ends[0] >= kept_ends[1])).size:
+        j = int(emptied[0])
+        raise ValueError(
+            f"between_samples={points} leaves nothing of row {j + 1} of the box: a disturbance takes {rho[j]:.3g} of half "
+            f"its range, and what is between the times {eta[j]:.3g}; more of them, a shorter dt or less disturbance would "
+            "help"
+        )
     return {
         "kept_ends": read_only(kept_ends),
+        "arriving": read_only(rho),
         "step_rows": read_only(np.concatenate([plant.mixed_rows, *rows[1:]])),
         "step_ends": read_only(np.hstack([plant.mixed_ends, np.tile(kept_ends, points - 1)])),
     }

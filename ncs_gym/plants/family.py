@@ -13,9 +13,9 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, as_set
+from ncs_gym.ellipsoid import Ellipsoid, UncertainSet, outer_sum
 from ncs_gym.limits import sides
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, UncertainSet, outer_sum
 from ncs_gym.validation import (
     ReadOnlyArrays,
     as_flag,

@@ -6,10 +6,10 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import DELTA, Ball, Bounds, Gaussian, Through
+from ncs_gym.ellipsoid import truncation_energy
 from ncs_gym.limits import Limits
 from ncs_gym.model import Model
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.uncertainty.ellipsoid import truncation_energy
 from ncs_gym.validation import as_number
 
 

@@ -20,24 +20,23 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import DELTA, Ball, Bounds, Sum, pushes_of
-from ncs_gym.limits import Limits, LimitValues, reach_in_steps, weight_of
-from ncs_gym.model import Model
-from ncs_gym.plants.between_samples import kept_at_all_times
-from ncs_gym.reading import json_values, read_text
-from ncs_gym.uncertainty.ellipsoid import (
+from ncs_gym.ellipsoid import (
+    INFLATION,
     Ellipsoid,
     TruncatedGaussian,
     document_of,
     ellipsoid_around_sum,
+    inflated,
     outer_sum,
     read_back,
     truncation_energy,
 )
+from ncs_gym.limits import Limits, LimitValues, reach_in_steps, weight_of
+from ncs_gym.model import Model
+from ncs_gym.plants.between_samples import kept_at_all_times
+from ncs_gym.reading import json_values, read_text
 from ncs_gym.validation import as_names, counted, read_only, reason_of, setting, shown
 
-# Relative growth of every hard bound for the rounding of sampling and quantizing (docs/shield_proof.md), and of its
-# diagonal, where it is flat.
-INFLATION, FLAT_INFLATION = 1.0 + 1e-9, 1e-12
 # No disturbance set is thinner than this, in squared half-widths of the safe box.
 THINNEST = 1e-19
 # Simulating a step in float64 rounds; the disturbance bound has room for that up to this many half-widths out.
@@ -103,11 +102,6 @@ class Source(NamedTuple):
         return samples + self.bound.sample(rng, count)
 
 
-def inflated(shape: np.ndarray) -> np.ndarray:
-    """Returns a slightly larger bound, with room for the rounding of its entries, also where it is flat."""
-    return INFLATION * shape + FLAT_INFLATION * np.diag(np.diag(shape))
-
-
 # Columns of the description: where its texts begin, and where they end.
 _INDENT, _WIDTH = 16, 80
 # What an end of a limit and its operating point differ from each other by rounding, relative to them, is printed as 0.
@@ -147,6 +141,7 @@ class LinearPlant(LimitValues):
         dt, continuous_model, between_samples: Those of the model and the limits.
         kept_ends: Ends of `box` that proofs keep at the sampling instants, shape (2, k): `box_ends`, or closer ones
             where the box counts between samples, too.
+        arriving: rho of each row of the box, shape (k,): the part of that which is due to the disturbance of a step.
         step_rows, step_ends: Limits of (x, u) at the beginning of a step that proofs keep, shapes (g, n + m) and (2,
             g): the mixed ones, and rows of the box at the other times of the step, by time.
         n, m, p: Number of states, inputs and outputs.
@@ -175,6 +170,7 @@ class LinearPlant(LimitValues):
     of_first_error: Source = field(init=False)
     remainder: Any = field(init=False)
     kept_ends: np.ndarray = field(init=False)
+    arriving: np.ndarray = field(init=False)
     step_rows: np.ndarray = field(init=False)
     step_ends: np.ndarray = field(init=False)
     delta: float = field(init=False)
@@ -207,7 +203,8 @@ class LinearPlant(LimitValues):
         self._set(**vars(whole), n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
         self._declare([declared, *sums[1:]], rest)
         self._name()
-        self._set(kept_ends=self.box_ends, step_rows=self.mixed_rows, step_ends=self.mixed_ends)
+        self._set(kept_ends=self.box_ends, arriving=np.zeros(len(self.box)))
+        self._set(step_rows=self.mixed_rows, step_ends=self.mixed_ends)
         if self.between_samples is not None:
             has_remainder = len(declared.parts) < len(sums[0].parts)
             if self.continuous_model is None or self.past or has_remainder or self.step_offset.any():
@@ -373,7 +370,9 @@ class LinearPlant(LimitValues):
 
     def _if_symmetric(self, value: np.ndarray) -> np.ndarray:
         if not self.is_symmetric:
-            raise ValueError("this needs limits |c_j x| <= 1 and |u_i| <= u_max_i alone, and the plant has others")
+            raise ValueError(
+                "this needs limits |c_j x| <= 1 at samples and |u_i| <= u_max_i alone, and the plant has others"
+            )
         return value
 
     @cached_property

@@ -10,12 +10,12 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import Bounds, Box, Sum
+from ncs_gym.ellipsoid import Ellipsoid, rounded_up
 from ncs_gym.limits import Limits
 from ncs_gym.model import Model
 from ncs_gym.plants.family import Remainder
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import FunctionProcess, LinearProcess, Process
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid, rounded_up
 from ncs_gym.validation import as_count, as_matrix, as_number, as_setting, counted, shown, warn_caller
 
 # Fresh samples that check a bound, as a fraction of those that it was found with.

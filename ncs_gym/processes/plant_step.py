@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from ncs_gym.bounds import Bounds
+from ncs_gym.disturbances import BY_NAME, ROUNDING, Disturbance, checked
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.limits import acting
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import FamilyProcess, LinearProcess, Process, own_process
-from ncs_gym.uncertainty.disturbances import BY_NAME, ROUNDING, Disturbance, checked
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import guarded, read_only
 
 # Noise is drawn for about this many environment steps at once, for this many steps of one environment at most.

@@ -141,3 +141,19 @@ def sent_at(step: int, network: ChannelState, arrived: list[Packet]) -> tuple[in
         return None
     arrivals = {step: arrived} | network.in_flight
     return step, next((k for k, packets in arrivals.items() if step in {p.stamp for p in packets}), None)
+
+
+def note_of(guard: Any, info: Mapping[str, Any]) -> Annotation | None:
+    """Returns what the picture of the last step shows of a guard, given its info; None without a guard."""
+    if guard is None:
+        return None
+    judge = guard.filter
+    return Annotation(
+        safe_set=judge.certificate.safe_set,
+        label=judge.mode,
+        proposed=info["input_proposed"] if info["episode_steps"] > 0 else None,
+        intervened=bool(info["shield_intervened"]),
+        interventions=int(info["episode_interventions"]),
+        protects=judge.mode != "monitor",
+        plan=guard.stored.copy() if judge.mode == "lookahead" else None,
+    )

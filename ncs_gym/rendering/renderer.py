@@ -8,12 +8,20 @@ from typing import Any
 
 import numpy as np
 
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.rendering import theme
-from ncs_gym.rendering.episode_record import RECENT_STEPS, Annotation, ConvexSet, EpisodeRecord, TrackedOutput
+from ncs_gym.rendering.episode_record import (
+    RECENT_STEPS,
+    Annotation,
+    ConvexSet,
+    EpisodeRecord,
+    TrackedOutput,
+    note_of,
+    sent_at,
+)
 from ncs_gym.rendering.theme import Canvas
 from ncs_gym.tasks import Task
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import counted
 
 # The axes reach this far, in units of half their range; a state farther out is drawn so many pixels inside the border.
@@ -423,16 +431,14 @@ class Renderer:
         self._plane = PhasePlane(plant)
         self._canvas: Canvas | None = None
 
-    def begin(self, info: Mapping[str, Any], task_state: Any, note: Annotation | None = None) -> None:
-        """Starts an episode, with the info that `reset` returns, the state of the task, and what a shield knows."""
-        self.episode.begin(info, task_state, note)
+    def begin(self, info: Mapping[str, Any], task_state: Any, guard: Any) -> None:
+        """Starts an episode, with the info that `reset` returns, the state of the task, and the guard or None."""
+        self.episode.begin(info, task_state, note_of(guard, info))
         self._show()
 
-    def record(
-        self, info: Mapping[str, Any], task_state: Any, sent: tuple[int, Any] | None, note: Annotation | None = None
-    ) -> None:
-        """Adds a step, with its info, the state of the task after it, its sample (None where none is sent)."""
-        self.episode.add(info, task_state, sent, note)
+    def record(self, info: Mapping[str, Any], task_state: Any, loop: Any, guard: Any) -> None:
+        """Adds a step, with its info, and task, loop and guard after it."""
+        self.episode.add(info, task_state, sent_at(loop.steps, loop.network, loop.received), note_of(guard, info))
         self._show()
 
     def render(self) -> np.ndarray | None:

@@ -15,8 +15,20 @@ from shields.certificate_text import counted, table
 from shields.errors import CertificateError
 from shields.paper.bounds import SMALLEST_GAP, PaperModel, unknown_bounds
 from shields.verification import Report
-from shields.verification.condition import Condition, flag, matrix_condition, scalar_condition
-from shields.verification.rational_matrix import Matrix, add, multiply, quadratic, rational, scale, subtract, transpose
+from shields.verification.rational_matrix import (
+    Condition,
+    Matrix,
+    add,
+    flag,
+    matrix_condition,
+    multiply,
+    quadratic,
+    rational,
+    scalar_condition,
+    scale,
+    subtract,
+    transpose,
+)
 
 # alpha and eps_up are square roots and quantiles in float64; their rounding counts as this much against the
 # certificate.

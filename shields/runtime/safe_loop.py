@@ -10,11 +10,16 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, LinearPlant, Packet
-from ncs_gym.envs.belief import Belief
 from ncs_gym.estimation.arrival_histories import arrival_histories
-from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.network.channel import DiscardedPackets, UnusedPacketsWarning, as_packet, require_on_request
-from ncs_gym.network.contract import MAX_AGE, warn_of_broken_contract
+from ncs_gym.estimation.estimator import Belief, Estimator
+from ncs_gym.network.channel import (
+    MAX_AGE,
+    DiscardedPackets,
+    UnusedPacketsWarning,
+    as_packet,
+    require_on_request,
+    warn_of_broken_contract,
+)
 from ncs_gym.network.downlink import AppliedInputs, Command, CommittedInputs, Echo, as_echo, downlink_protocol
 from ncs_gym.network.requests import Requests
 from ncs_gym.validation import (
@@ -29,8 +34,7 @@ from ncs_gym.validation import (
     warn_caller,
 )
 from shields.certificate import Certificate
-from shields.runtime.guarantee import EXPLANATIONS, LATE_INPUT, NOT_CONFIRMED, OTHER_EPISODE, OTHER_INPUT
-from shields.runtime.guard import Guard
+from shields.runtime.guard import EXPLANATIONS, LATE_INPUT, NOT_CONFIRMED, OTHER_EPISODE, OTHER_INPUT, Guard
 from shields.runtime.safety_filter import Decision, SafetyFilter
 
 NOT_STARTED = "no episode is under way: call start"

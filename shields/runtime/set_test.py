@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from ncs_gym import LinearPlant
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER, is_inside
+from ncs_gym.ellipsoid import SMALLEST_MULTIPLIER, is_inside
 from ncs_gym.validation import frozen, read_only
 from shields.certificate import Certificate, CertificateError
 from shields.polytope import Polytope

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import Ellipsoid, LinearPlant
+from ncs_gym.ellipsoid import outer_sum
 from ncs_gym.estimation.kalman_filter import enlarged_by_rounding
-from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields.certificate import Certificate
 from shields.polytope import Polytope
 from shields.runtime.safety_filter import MARGIN, SafetyFilter

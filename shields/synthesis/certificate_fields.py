@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import Ellipsoid, LinearPlant, exact
+from ncs_gym.ellipsoid import inflated
 from ncs_gym.estimation.error_bound import ErrorSet
-from ncs_gym.plants.linear_plant import inflated
 from shields.certificate import Certificate, Proof, Updates
 from shields.certificate_text import reach_in
 from shields.polytope import Polytope

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ncs_gym import LinearPlant, exact
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.channel import ChannelContract
 from ncs_gym.validation import as_number, shown
 from shields.certificate import Certificate
 from shields.errors import Infeasible
@@ -95,7 +95,7 @@ def synthesize(
     if not (polytope or _may_keep_ellipsoid(plant)):
         raise ValueError(
             "only a polytope is sought where limits are not symmetric, not all states have any, or some are of states "
-            "and inputs together"
+            "and inputs together, or between samples"
         )
     search = Search(progress, time_limit)
     try:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import ChannelContract, ErrorSetError, LinearPlant, UnstablePlantError, exact
+from ncs_gym.ellipsoid import is_inside, joined
 from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
-from ncs_gym.uncertainty.ellipsoid import is_inside, joined
 from shields.errors import Infeasible
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid
 from shields.verification import ACTION_ROUNDING

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ncs_gym import LinearPlant
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.channel import ChannelContract
 from shields.certificate import Certificate
 from shields.errors import Infeasible
 from shields.synthesis.certificate_fields import certificate_of

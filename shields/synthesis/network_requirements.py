@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ncs_gym import ChannelContract, LinearPlant
-from ncs_gym.network.contract import MAX_AGE
+from ncs_gym.network.channel import MAX_AGE
 from ncs_gym.validation import as_count, as_number
 from shields.certificate import Certificate
 from shields.errors import Infeasible

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from ncs_gym import LinearPlant, exact
-from ncs_gym.network.contract import ChannelContract
+from ncs_gym.network.channel import ChannelContract
 from shields.certificate import Certificate, Proof
 from shields.errors import Infeasible
 from shields.polytope import Polytope

@@ -10,9 +10,9 @@ from scipy.linalg import null_space
 from scipy.optimize import linprog
 
 from ncs_gym import LinearPlant, exact
-from ncs_gym.plants.linear_plant import inflated, weight_of
+from ncs_gym.ellipsoid import inflated, outer_sum
+from ncs_gym.plants.linear_plant import weight_of
 from ncs_gym.plants.lqr import lqr_gain
-from ncs_gym.uncertainty.ellipsoid import outer_sum
 from shields.errors import Infeasible
 from shields.synthesis.design_problem import Rest, SymmetricLimits
 

@@ -92,7 +92,11 @@ class Tolerance:
         self._x, self._u = plant.half_widths, plant.input_half
         self._A, self._B = plant.A * self._x / self._x[:, None], plant.B * self._u / self._x[:, None]
         self._errors, self._D = errors / np.outer(self._x, self._x), D / np.outer(self._x, self._x)
-        self._limits = limit_rows(plant)
+        limits, q = limit_rows(plant), len(plant.mixed_rows)
+        times = (len(plant.step_rows) - q) // len(plant.box)
+        # Of what is not left of the box between samples this part is one of the radii.
+        self._arriving = np.concatenate([plant.arriving, np.zeros(plant.m + q), np.tile(plant.arriving, times)])
+        self._limits = limits._replace(low=limits.low - self._arriving, high=limits.high + self._arriving)
         self._state, self._input = self._limits.rows[:, : plant.n] * self._x, self._limits.rows[:, plant.n :] * self._u
 
     def of(self, K: np.ndarray) -> Tolerated | None:
@@ -191,7 +195,7 @@ class Tolerance:
         by_disturbance, to_disturbance = _support(rows, self._D[None])
         by_errors, to_errors = _support(rows @ answer, self._errors)
         at_once, to_input = _support(self._input @ K, self._errors)
-        needs = by_disturbance.sum(axis=0) + by_errors.sum(axis=0) + at_once
+        needs = by_disturbance.sum(axis=0) + by_errors.sum(axis=0) + at_once + self._arriving
         needs = np.maximum(needs, _SMALLEST_NEED)
         if not slopes:
             return needs, np.empty((0, *K.shape))

@@ -5,7 +5,7 @@ Every float is a dyadic rational, so `rational_matrix` evaluates a condition wit
 states the conditions of docs/shield_proof.md, "Conditions".
 """
 
-from shields.verification.condition import ACTION_ROUNDING, Condition
+from shields.verification.rational_matrix import ACTION_ROUNDING, Condition
 from shields.verification.verifier import Report, require_valid, verify
 
 __all__ = ["ACTION_ROUNDING", "Condition", "Report", "require_valid", "verify"]

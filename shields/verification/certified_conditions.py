@@ -9,17 +9,21 @@ from fractions import Fraction
 import numpy as np
 
 from ncs_gym import Ellipsoid, LinearPlant
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
+from ncs_gym.ellipsoid import SMALLEST_MULTIPLIER
 from shields.certificate import Certificate, Updates
-from shields.verification.condition import ACTION_ROUNDING, Condition, flag, matrix_condition, scalar_condition
 from shields.verification.polytope_conditions import polytope_conditions
 from shields.verification.rational_matrix import (
+    ACTION_ROUNDING,
+    Condition,
     Matrix,
     add,
     congruence,
+    flag,
+    matrix_condition,
     multiply,
     quadratic,
     rational,
+    scalar_condition,
     scale,
     subtract,
 )

@@ -13,14 +13,17 @@ from scipy.linalg import qr
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.polytope import Polytope
-from shields.verification.condition import ACTION_ROUNDING, Condition, flag, scalar_condition
 from shields.verification.rational_matrix import (
+    ACTION_ROUNDING,
+    Condition,
     Matrix,
     add,
     congruence,
+    flag,
     multiply,
     quadratic,
     rational,
+    scalar_condition,
     subtract,
     to_float,
     transpose,

@@ -10,7 +10,7 @@ from shields.certificate import Certificate
 from shields.certificate_text import labeled
 from shields.errors import CertificateError
 from shields.verification.certified_conditions import certified_conditions
-from shields.verification.condition import Condition, flag
+from shields.verification.rational_matrix import Condition, flag
 
 # Where the name of a condition says which age, or row of the polytope, it is about.
 _AGE = re.compile(r"(?<=Sigma_)\d+| at age \d+| of row \d+")

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 from experiments.report import comparison_report, sweep_table
 from shields import Report
-from shields.verification.condition import flag
+from shields.verification.rational_matrix import flag
 from tests.experiments.results import ALL_ARMS, run, summary_of
 
 VERIFIED = Report((flag("(E1) Sigma - A Sigma A' >= 0", True), flag("(S) the safe set", True)))

@@ -25,8 +25,8 @@ from ncs_gym import (
     SpeedTracking,
     truck_trailer,
 )
+from ncs_gym.disturbances import BallDisturbance
 from ncs_gym.envs.env import NCSEnv
-from ncs_gym.uncertainty.disturbances import BallDisturbance
 from tests.fuzz import NOTHING_USABLE, WRONG_NUMBERS
 
 PLANT = truck_trailer()

@@ -11,8 +11,8 @@ import pytest
 
 from ncs_gym import Ellipsoid
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, Through, as_set
+from ncs_gym.disturbances import diagonal_inside
 from ncs_gym.plants.family import Remainder
-from ncs_gym.uncertainty.disturbances import diagonal_inside
 
 E = np.array([[1.0, 0.5], [0.0, 2.0], [0.3, 0.0]])
 SETS = {

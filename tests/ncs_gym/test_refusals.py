@@ -47,6 +47,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.bounds import as_set
+from ncs_gym.disturbances import as_disturbance, checked
 from ncs_gym.envs.env import RenderModeError, ncs_env
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
@@ -59,7 +60,6 @@ from ncs_gym.processes.cart_pole_process import CartPoleProcess
 from ncs_gym.processes.gym_pendulum import PendulumProcess, pendulum
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess
 from ncs_gym.processes.process import LinearProcess
-from ncs_gym.uncertainty.disturbances import as_disturbance, checked
 from tests.product import altered, linear_plant
 
 TRUCK, POLE, LINEAR = "ncs_gym/TruckTrailer-v0", "ncs_gym/CartPole-v0", "ncs_gym/LinearNCS-v0"

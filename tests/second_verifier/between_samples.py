@@ -9,9 +9,8 @@ import numpy as np
 from flint import arb, arb_mat, ctx, fmpq
 
 from ncs_gym import LinearPlant
-from shields.verification.condition import Condition
+from shields.verification.rational_matrix import Condition
 from tests.second_verifier.exact import PRECISION, ball_at_least_zero, form, is_so, matrix, number
-from tests.second_verifier.polytope import extents
 
 
 def row_conditions(plant: LinearPlant) -> Iterator[Condition]:
@@ -22,10 +21,12 @@ def row_conditions(plant: LinearPlant) -> Iterator[Condition]:
     fits = fits and plant.step_rows[:q].tolist() == plant.mixed_rows.tolist()
     fits = fits and plant.step_ends[:, :q].tolist() == plant.mixed_ends.tolist()
     yield is_so("rows at all other times, with the ends of those at samples", fits)
-    ends = [[number(end) if np.isfinite(end) else None for end in pair] for pair in plant.box_ends.T]
-    widths = extents(matrix(plant.box).tolist(), ends, k)
-    if not fits or widths is None:
+    if not fits:
         return
+    both = np.isfinite(plant.box_ends).all(axis=0)
+    C, sizes = matrix(plant.box[both]), [number(each) for each in np.abs(plant.box_ends[:, both]).max(axis=0)]
+    inverse = (C.transpose() * C).inv() * C.transpose()
+    widths = [sum((abs(inverse[i, j]) * size for j, size in enumerate(sizes)), fmpq(0)) for i in range(n)]
     with ctx.workprec(PRECISION):
         needed = _remainders(plant, widths + [number(limit) for limit in plant.largest_input])
         for j, least in enumerate(needed):

@@ -10,9 +10,9 @@ import numpy as np
 from flint import arb, ctx, fmpq
 
 from ncs_gym import Ellipsoid, LinearPlant
-from ncs_gym.uncertainty.ellipsoid import TruncatedGaussian
+from ncs_gym.ellipsoid import TruncatedGaussian
 from shields.certificate import Certificate
-from shields.verification.condition import Condition
+from shields.verification.rational_matrix import Condition
 from tests.second_verifier.exact import PRECISION, at_least_zero, definite, identity, is_so, matrix, number
 
 # No term of a sum of ellipsoids gets a smaller weight.

@@ -11,7 +11,7 @@ from flint import fmpq
 
 from ncs_gym import Ellipsoid, LinearPlant
 from shields.certificate import Certificate
-from shields.verification.condition import Condition
+from shields.verification.rational_matrix import Condition
 from tests.second_verifier.bounds import bound_conditions
 from tests.second_verifier.exact import (
     FLOAT32,

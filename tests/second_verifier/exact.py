@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from shields.verification.condition import Condition
+from shields.verification.rational_matrix import Condition
 
 # An action in [-1, 1] that becomes a float32 moves by at most half a unit in the last of 24 binary digits.
 FLOAT32 = fmpq(1, 2**24)

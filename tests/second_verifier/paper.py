@@ -10,7 +10,7 @@ from flint import arb, ctx, fmpq, fmpq_mat
 
 from ncs_gym import LinearPlant
 from shields.paper import PaperCertificate
-from shields.verification.condition import Condition
+from shields.verification.rational_matrix import Condition
 from tests.second_verifier.bounds import keeps_enough
 from tests.second_verifier.exact import (
     PRECISION,

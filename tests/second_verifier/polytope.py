@@ -11,7 +11,7 @@ from flint import arb, ctx, fmpq, fmpq_mat
 from ncs_gym import LinearPlant
 from shields.certificate import Certificate
 from shields.polytope import Polytope
-from shields.verification.condition import Condition
+from shields.verification.rational_matrix import Condition
 from tests.second_verifier.exact import (
     FLOAT32,
     PRECISION,

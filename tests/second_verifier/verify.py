@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from ncs_gym import LinearPlant
 from shields import Certificate, Report
 from shields.paper import PaperCertificate
-from shields.verification.condition import Condition
+from shields.verification.rational_matrix import Condition
 from tests.second_verifier.certified import certified_conditions
 from tests.second_verifier.exact import is_so
 from tests.second_verifier.paper import paper_conditions

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from shields import Certificate, Infeasible, verify
+from ncs_gym import ChannelContract
+from shields import Certificate, Infeasible, silence_of, verify
 from shields.polytope import Polytope
 from shields.runtime.starts import starts_known
 from tests.certificates import certificate_of
 from tests.plants import named, with_radii
-from tests.product import altered, safety_filter, synthesize
+from tests.product import altered, safety_filter, sampled_plant, synthesize
 from tests.second_verifier.verify import verify_again
 from tests.verdicts import verified
 
@@ -113,3 +114,28 @@ def test_limits_that_bind_within_a_step_are_named_like_those_of_the_box():
     plant, contract = named("servo, at all times")
     with pytest.raises(Infeasible, match=r"those that bind: \|x2\| <= 4, \|x1\| <= 0.2\)"):
         synthesize(with_radii(plant, 1.3), contract=contract)
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.02])
+def test_what_a_certificate_says_to_be_tolerated_is_so(factor):
+    plant, contract = named("servo, at all times")
+    scale = synthesize(plant, contract=contract).provenance["tolerated_scale"]
+    larger = with_radii(plant, factor * scale)
+    if factor < 1.0:
+        assert verified(synthesize(larger, contract=contract), larger).valid
+    else:
+        with pytest.raises(Infeasible):
+            synthesize(larger, contract=contract)
+
+
+def test_silence_counts_from_states_in_the_box_where_ways_count():
+    """From an estimate in half of S the first state may be so near its limit that it is beyond it before the sample."""
+    plant = sampled_plant(
+        ([[-np.log(10.0)]], [[0.01 * np.log(10.0)]], [[1.0]], [[0.0]]),
+        1.0,
+        **{"box": [1.0], "u_max": 1.0, "disturbance_bound": [0.38], "sensor_bound": 0.35, "initial_bound": [0.4]},
+        between_samples=4,
+    )
+    certificate = synthesize(plant, contract=ChannelContract(2))
+    assert 0.5 * certificate.safe_set.high[0] + np.sqrt(certificate.Sigma[0, 0]) > plant.kept_ends[1, 0]
+    assert silence_of(certificate, plant).at_half == 0

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ncs_gym.uncertainty.ellipsoid import SMALLEST_MULTIPLIER
+from ncs_gym.ellipsoid import SMALLEST_MULTIPLIER
 from ncs_gym.validation import read_only
 from shields.runtime.set_test import SMALLEST_RADIUS, SetTest, ball, closed, judged_shapes, supports
 

@@ -14,7 +14,7 @@ from ncs_gym.network.packet_loss_and_delay import ChannelState, LossState
 from ncs_gym.plants.lqr import regulator_gain
 from ncs_gym.processes.plant_step import PlantSimulation
 from shields import Certificate, SafetyShield
-from shields.runtime.guarantee import OUTSIDE_BOUND
+from shields.runtime.guard import OUTSIDE_BOUND
 from tests import arrays
 from tests.certificates import metric
 from tests.product import safe_loop, safety_shield, vector_shield

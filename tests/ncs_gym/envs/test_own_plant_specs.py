@@ -24,9 +24,9 @@ from ncs_gym import (
     SpeedTracking,
     TraceChannel,
 )
+from ncs_gym.disturbances import BallDisturbance, SphereDisturbance
 from ncs_gym.processes.process import LinearProcess
 from ncs_gym.registration import registered_ids
-from ncs_gym.uncertainty.disturbances import BallDisturbance, SphereDisturbance
 from shields import SafetyShield
 from tests.certificates import certificate_of
 from tests.product import linear_plant, safety_shield

@@ -4,7 +4,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from ncs_gym import Ellipsoid, SpeedTracking, truck_trailer
-from ncs_gym.uncertainty.disturbances import BallDisturbance
+from ncs_gym.disturbances import BallDisturbance
 from tests.product import library_plant, vector_env
 
 

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from benchmarks.networks import KINDS, gains_taken
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truck_trailer
+from ncs_gym.ellipsoid import FLAT_INFLATION, quick_test
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.error_bound import ErrorSet, certified_error_set
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.estimation.innovation import quick_test
 from ncs_gym.estimation.kalman_filter import (
     ErrorRecursion,
     SetMembership,
@@ -21,7 +21,6 @@ from ncs_gym.estimation.kalman_filter import (
 )
 from ncs_gym.network.channel import GilbertElliott
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from ncs_gym.plants.linear_plant import FLAT_INFLATION
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.plants import random_plant
 from tests.product import altered, library_plant, linear_plant, sampled_plant

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, cart_pole
+from ncs_gym.ellipsoid import is_inside
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import VectorEstimator
 from ncs_gym.estimation.kalman_filter import SHAPE_STEP, SetMembership
-from ncs_gym.uncertainty.ellipsoid import is_inside
 from tests.product import linear_plant, rate_limited, sampled_plant
 
 

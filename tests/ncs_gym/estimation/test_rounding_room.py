@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid
+from ncs_gym.ellipsoid import INFLATION, is_inside
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import SetMembership
-from ncs_gym.plants.linear_plant import INFLATION, SIMULATED_REACH
-from ncs_gym.uncertainty.ellipsoid import is_inside
+from ncs_gym.plants.linear_plant import SIMULATED_REACH
 from shields.verification.rational_matrix import congruence, rational
 from tests.product import altered, linear_plant
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, Packet
+from ncs_gym.ellipsoid import is_inside
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion
-from ncs_gym.uncertainty.ellipsoid import is_inside
 from tests.plants import random_plant
 from tests.product import altered
 

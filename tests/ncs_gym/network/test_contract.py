@@ -16,6 +16,7 @@ from ncs_gym import (
     contract_of,
     truck_trailer,
 )
+from ncs_gym.ellipsoid import is_inside
 from ncs_gym.estimation import kalman_filter
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.error_bound import certified_error_set, require_error_set
@@ -23,7 +24,6 @@ from ncs_gym.estimation.estimator import Estimator
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics, SetMembership
 from ncs_gym.network.packet_loss_and_delay import ChannelState
 from ncs_gym.plants.library import batch_reactor
-from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields.verification.rational_matrix import (
     add,
     congruence,

@@ -54,6 +54,25 @@ def test_rows_are_those_of_the_model_with_ends_that_are_closer(name):
     assert len(list(row_conditions(plant))) == 1 + 2 * k
 
 
+def test_rows_of_boxes_with_one_end_two_ends_and_more_rows_than_states_are_right():
+    model = [[0.0, 1.0], [-4.0, -1.0]], [[0.0], [4.0]], np.eye(2), np.zeros((2, 1))
+    ends = {"state_limits": ([-1.2, -3.0], [0.9, 2.0]), "input_limits": (-1.0, 2.0)}
+    rows = [([1.0, 0.0], -0.8, 0.8), ([1.0, 2.0], -3.0, 2.0), ([1.0, -0.5], -1.0, np.inf)]
+    bounds = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
+    plant = sampled_plant(model, 0.1, output_limits=rows, between_samples=5, **ends, **bounds)
+    assert plant.kept_ends[1, -1] == np.inf
+    conditions = list(row_conditions(plant))
+    assert len(conditions) == 1 + 2 * len(plant.box)
+    assert all(condition.holds for condition in conditions)
+
+
+def test_limits_of_which_nothing_is_left_are_refused():
+    model = [[0.0, 1.0], [-900.0, -6.0]], [[0.0], [900.0]], np.eye(2), np.zeros((2, 1))
+    bounds = {"disturbance_bound": 0.01, "sensor_bound": 0.01, "initial_bound": 0.01}
+    with pytest.raises(ValueError, match=r"leaves nothing of row 1 of the box: .* more of them, a shorter dt or less"):
+        sampled_plant(model, 0.1, box=[1.0, 45.0], u_max=1.0, between_samples=2, **bounds)
+
+
 OTHER_ROWS = {
     "ends of samples": lambda p: {"kept_ends": p.box_ends + 0.95 * (p.kept_ends - p.box_ends)},
     "ends within": lambda p: {"step_ends": 1.01 * p.step_ends},

@@ -6,8 +6,8 @@ import pytest
 from scipy.linalg import expm
 
 from ncs_gym import truck_trailer
+from ncs_gym.ellipsoid import TruncatedGaussian, truncation_energy
 from ncs_gym.plants.library import convoy, lane_keeping, stirred_tank
-from ncs_gym.uncertainty.ellipsoid import TruncatedGaussian, truncation_energy
 from tests.product import altered, library_plant
 
 BOUNDS = ("disturbance_bound", "sensor_bound", "initial_bound")

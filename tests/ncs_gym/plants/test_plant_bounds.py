@@ -5,8 +5,8 @@ import pytest
 
 import ncs_gym
 from ncs_gym import Ellipsoid, truck_trailer
+from ncs_gym.disturbances import BY_NAME, as_disturbance
 from ncs_gym.estimation.estimator import Estimator
-from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
 from tests.product import altered, linear_plant
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 from scipy.integrate import solve_ivp
 
-from ncs_gym.uncertainty.disturbances import BY_NAME, as_disturbance
+from ncs_gym.disturbances import BY_NAME, as_disturbance
 from tests.product import sampled_plant
 
 A, B, C, D = np.array([[0.0, 1.0], [-2.0, -3.0]]), np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))

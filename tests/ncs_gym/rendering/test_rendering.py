@@ -86,7 +86,7 @@ def test_plants_of_any_size_are_drawn_and_what_a_shield_does(n, m):
     acting = {"proposed": 9.0 * np.ones(m), "intervened": True, "interventions": 1, "protects": n > 1}
     note = Annotation(safe_set=Ellipsoid(np.eye(n)), label="project", **acting)
     *_, info = env.step(env.action_space.sample())
-    env.unwrapped.renderer.record(info, None, None, note)
+    env.unwrapped.renderer.episode.add(info, None, None, note)
     frame = env.render()
     assert count(frame, theme.SAFE_FILL, theme.PLANE) > 1000
     assert (count(frame, theme.SHIELD, theme.HEADER) > 2000) is (n > 1)

@@ -97,6 +97,7 @@ class Between:
     """How far out of the box a step gets on a fine grid of times, under the disturbance that is worst at each time."""
 
     def __init__(self, plant: Any) -> None:
+        assert (np.abs(plant.box_ends) == 1.0).all()
         G = np.pad(plant.continuous_model, ((0, plant.m), (0, 0)))
         times = plant.dt * np.arange(FINE + 1) / FINE
         self.rows = plant.box @ np.array([expm(G * tau)[: plant.n] for tau in times])

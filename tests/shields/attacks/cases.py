@@ -18,7 +18,7 @@ from ncs_gym import (
     cart_pole,
     truck_trailer,
 )
-from ncs_gym.network.contract import contract_of
+from ncs_gym.network.channel import contract_of
 from ncs_gym.plants.library import batch_reactor
 from ncs_gym.processes.process import FamilyProcess, Process
 from shields import Certificate

@@ -15,7 +15,7 @@ from shields import SafetyFilter
 from shields.polytope import Polytope
 from shields.runtime import safety_filter
 from shields.runtime.backup_plans import plan_check
-from shields.runtime.guarantee import OLD_SAMPLE
+from shields.runtime.guard import OLD_SAMPLE
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 from tests.product import altered
 from tests.shields.attacks.cases import CASES, RANDOM, case

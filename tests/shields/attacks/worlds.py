@@ -13,7 +13,7 @@ from ncs_gym import Actuator, Channel, Disturbance, Ellipsoid, LinearPlant, NCSE
 from ncs_gym.estimation.arrival_histories import histories_of
 from ncs_gym.estimation.error_bound import certified_error_set
 from ncs_gym.estimation.estimator import VectorEstimator
-from ncs_gym.network.contract import contract_of
+from ncs_gym.network.channel import contract_of
 from shields import Certificate, silence_of
 from tests.ncs_gym.envs.same_draws import holding_gain
 from tests.product import safe_loop, safety_shield, vector_env, vector_shield

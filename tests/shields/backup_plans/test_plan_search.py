@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid
-from ncs_gym.uncertainty.ellipsoid import outer_sum
+from ncs_gym.ellipsoid import outer_sum
 from tests.certificates import metric
 from tests.product import safety_filter
 from tests.shields.attacks.cases import case

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Ellipsoid, truck_trailer
-from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT
+from shields.runtime.guard import NOT_KNOWN_INSIDE, OTHER_INPUT
 from shields.runtime.starts import starts_in_box
 from tests.certificates import certificate_of
 from tests.product import loop_env, safe_loop, safety_filter, safety_shield, vector_env, vector_shield

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Packet
-from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OLD_SAMPLE
+from shields.runtime.guard import NOT_KNOWN_INSIDE, OLD_SAMPLE
 from tests.certificates import certificate_of
 from tests.product import safe_loop
 from tests.shields.attacks.cases import plan_case

@@ -6,7 +6,7 @@ import pytest
 from ncs_gym import Actuator, Channel, Ellipsoid, cart_pole, truck_trailer
 from ncs_gym.network.downlink import downlink_protocol
 from ncs_gym.network.packet_loss_and_delay import ChannelState
-from shields.runtime.guarantee import (
+from shields.runtime.guard import (
     EXPLANATIONS,
     FAR_OUT,
     LARGE_ERROR,
@@ -14,8 +14,8 @@ from shields.runtime.guarantee import (
     NOT_KNOWN_INSIDE,
     OLD_SAMPLE,
     OTHER_INPUT,
+    GuaranteeMonitor,
 )
-from shields.runtime.guard import GuaranteeMonitor
 from shields.runtime.starts import starts_known
 from shields.verification.rational_matrix import (
     congruence,

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import Ellipsoid, cart_pole
-from ncs_gym.network.contract import ChannelContract, contract_of
+from ncs_gym.network.channel import ChannelContract, contract_of
 from ncs_gym.registration import CART_POLE_CHANNEL
 from shields.errors import Infeasible
 from shields.synthesis import invariant_polytope as search

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, ChannelContract, cart_pole, truck_trailer
-from shields.runtime.guarantee import ALARM
+from shields.runtime.guard import ALARM
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
 from tests.product import library_plant, vector_env, vector_shield

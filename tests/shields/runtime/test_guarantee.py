@@ -5,13 +5,12 @@ import numpy as np
 import pytest
 
 from ncs_gym import Channel, Packet
+from ncs_gym.ellipsoid import is_inside
 from ncs_gym.plants.linear_plant import SIMULATED_REACH
-from ncs_gym.uncertainty.ellipsoid import is_inside
 from shields import SafetyFilter, certificate_for
 from shields.runtime import Decision
-from shields.runtime import guarantee as proof
-from shields.runtime.guarantee import EXPLANATIONS
-from shields.runtime.guard import GuaranteeMonitor
+from shields.runtime import guard as proof
+from shields.runtime.guard import EXPLANATIONS, GuaranteeMonitor
 from tests.certificates import certificate_of
 from tests.product import belief, safe_loop, safety_filter, staying
 from tests.shields.attacks.cases import RANDOM, TRUCKS

@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode
 
 from ncs_gym import Channel, truck_trailer
 from shields import GuaranteeLostError, GuaranteeLostWarning
-from shields.runtime.guarantee import NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS
+from shields.runtime.guard import NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS
 from tests.certificates import certificate_of
 from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 

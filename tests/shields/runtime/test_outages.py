@@ -7,7 +7,7 @@ import pytest
 
 from ncs_gym import Actuator, Channel, ChannelContract, Packet, cart_pole
 from ncs_gym.network.downlink import Command
-from shields.runtime.guarantee import (
+from shields.runtime.guard import (
     LATE_INPUT,
     NOT_CONFIRMED,
     OTHER_EPISODE,

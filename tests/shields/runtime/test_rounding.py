@@ -10,7 +10,7 @@ import pytest
 from ncs_gym import Channel
 from shields import CertificateError
 from shields.polytope import Polytope
-from shields.runtime.guarantee import FAR_OUT, NOT_KNOWN_INSIDE
+from shields.runtime.guard import FAR_OUT, NOT_KNOWN_INSIDE
 from shields.runtime.safety_filter import require_computable
 from shields.runtime.set_test import certified_root, ellipsoid_test
 from shields.verification.rational_matrix import (

@@ -9,7 +9,7 @@ import torch
 
 from ncs_gym import Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truck_trailer
 from ncs_gym.network.channel import UnusedPacketsWarning
-from shields.runtime.guarantee import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OTHER_INPUT
+from shields.runtime.guard import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OTHER_INPUT
 from tests.certificates import certificate_of
 from tests.product import safe_loop
 

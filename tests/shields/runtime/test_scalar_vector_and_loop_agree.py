@@ -16,7 +16,7 @@ from ncs_gym import (
     truck_trailer,
 )
 from ncs_gym.plants.library import batch_reactor
-from shields.runtime import guarantee
+from shields.runtime import guard as guarantee
 from shields.runtime.safety_filter import MODES
 from tests.certificates import certificate_of
 from tests.ncs_gym.envs.same_draws import compare

@@ -11,7 +11,7 @@ import pytest
 from ncs_gym import Channel, Packet, truck_trailer
 from ncs_gym.network.channel import UnusedPacketsWarning
 from ncs_gym.processes.plant_step import PlantSimulation
-from shields.runtime.guarantee import NOT_FINITE
+from shields.runtime.guard import NOT_FINITE
 from tests.certificates import certificate_of
 from tests.product import loop_env, safe_loop, safety_shield, vector_env, vector_shield
 

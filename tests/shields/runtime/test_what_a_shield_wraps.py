@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from ncs_gym import AdversarialDisturbance, Channel, VectorRequestActions, truck_trailer
 from shields import SafetyShield
-from shields.runtime.guarantee import OTHER_INPUT, OTHER_STEPS
+from shields.runtime.guard import OTHER_INPUT, OTHER_STEPS
 from tests.certificates import certificate_of, metric
 from tests.product import loop_env, safety_shield, vector_env, vector_shield
 

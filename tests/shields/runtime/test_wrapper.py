@@ -7,7 +7,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from shields import SafetyShield
-from shields.runtime.guarantee import (
+from shields.runtime.guard import (
     NOT_KNOWN_INSIDE,
 )
 from tests.product import safety_shield

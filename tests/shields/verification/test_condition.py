@@ -8,7 +8,7 @@ import pytest
 
 from ncs_gym import Ellipsoid, truck_trailer
 from shields.verification import Condition, Report
-from shields.verification.condition import matrix_condition, scalar_condition
+from shields.verification.rational_matrix import matrix_condition, scalar_condition
 from tests.certificates import certificate_of
 from tests.product import altered, library_plant, paper_synthesis
 from tests.shields.verification.test_mutations import replaced

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ncs_gym import truck_trailer
-from ncs_gym.uncertainty.ellipsoid import TruncatedGaussian, truncation_energy
+from ncs_gym.ellipsoid import TruncatedGaussian, truncation_energy
 from shields import verify
 from shields.verification.rational_matrix import is_positive_semidefinite, rational
 from tests.certificates import certificate_of
@@ -28,13 +28,13 @@ from tests.verdicts import verified
 # The record of a verdict, and what a certificate and a plant consist of.
 MAY_IMPORT = {
     "ncs_gym",
-    "ncs_gym.uncertainty.ellipsoid",
+    "ncs_gym.ellipsoid",
     "ncs_gym.validation",
     "shields",
     "shields.certificate",
     "shields.paper",
     "shields.polytope",
-    "shields.verification.condition",
+    "shields.verification.rational_matrix",
 }
 
 
@@ -89,12 +89,13 @@ def test_the_verifiers_have_no_code_in_common():
             module = node.module if isinstance(node, ast.ImportFrom) else None
             if module is not None and module.startswith(("ncs_gym", "shields")):
                 assert module in MAY_IMPORT, (path.name, module)
-                if module == "shields.verification.condition":
+                if module == "shields.verification.rational_matrix":
                     assert [alias.name for alias in node.names] == ["Condition"], path.name
 
 
 @pytest.mark.parametrize(
-    "slip", ["shields.verification.condition.is_positive_semidefinite", "tests.second_verifier.exact.is_semidefinite"]
+    "slip",
+    ["shields.verification.rational_matrix.is_positive_semidefinite", "tests.second_verifier.exact.is_semidefinite"],
 )
 def test_a_slip_in_one_verifier_is_noticed_by_the_other(slip, certificate, loaded, monkeypatch):
     wrong = with_multipliers(certificate, error=1e-320)

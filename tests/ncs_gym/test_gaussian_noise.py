@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from ncs_gym import Channel, NCSVectorEnv, truck_trailer
+from ncs_gym.disturbances import BallDisturbance
 from ncs_gym.network.gaussian_bound import bound_violation_probability
 from ncs_gym.processes.plant_step import PlantSimulation
-from ncs_gym.uncertainty.disturbances import BallDisturbance
 from tests.product import library_plant, linear_plant, loop_env, vector_env
 
 DELTA = 0.2

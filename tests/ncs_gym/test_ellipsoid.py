@@ -5,8 +5,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize, minimize_scalar
 
 from ncs_gym import Ellipsoid
-from ncs_gym.estimation.innovation import outside_sum
-from ncs_gym.uncertainty.ellipsoid import farthest_coordinates, is_inside, joined, outer_sum
+from ncs_gym.ellipsoid import farthest_coordinates, is_inside, joined, outer_sum, outside_sum
 from shields.verification.rational_matrix import is_positive_semidefinite, rational, subtract
 
 seeds = st.integers(0, 10_000)

@@ -14,8 +14,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ncs_gym.ellipsoid import Ellipsoid
 from ncs_gym.plants.linear_plant import LinearPlant
-from ncs_gym.uncertainty.ellipsoid import Ellipsoid
 from ncs_gym.validation import (
     LARGEST_NUMBER,
     Shared,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ncs_gym import AdversarialDisturbance, SinusoidDisturbance
-from ncs_gym.uncertainty.disturbances import as_disturbance, checked
+from ncs_gym.disturbances import as_disturbance, checked
 
 
 def draws(source, plant, count=400, seed=0):

@@ -1,1 +1,0 @@
-"""Ellipsoids, sums of them, truncated noise and disturbances: what the guarantees assume about nature."""
