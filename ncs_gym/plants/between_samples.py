@@ -51,9 +51,9 @@ def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
     if (emptied := np.flatnonzero(kept_ends[0] >= kept_ends[1])).size:
         j = int(emptied[0])
         raise ValueError(
-            f"between_samples={points} leaves nothing of row {j + 1} of the box: a disturbance takes {rho[j]:.3g} of half "
-            f"its range, and what is between the times {eta[j]:.3g}; more of them, a shorter dt or less disturbance would "
-            "help"
+            f"between_samples={points} leaves nothing of row {j + 1} of the box: a disturbance takes {rho[j]:.3g} of "
+            f"half its range, what is between the times {eta[j]:.3g}; more of them, a shorter dt or less disturbance "
+            "would help"
         )
     return {
         "kept_ends": read_only(kept_ends),
