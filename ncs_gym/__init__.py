@@ -1,5 +1,7 @@
 """Imperfect networks around any Gymnasium environment, and plants behind them; importing registers the ids."""
 
+from typing import Any
+
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, Through
 from ncs_gym.disturbances import (
     AdversarialDisturbance,
@@ -38,6 +40,15 @@ from ncs_gym.registration import register_all, register_plant
 from ncs_gym.tasks import Regulation, SetpointTracking, SpeedTracking, Task
 
 __version__ = "0.1.0"
+
+
+def _renderer(*values: Any) -> Any:
+    from ncs_gym.rendering import Renderer  # imported here: most environments draw nothing
+
+    return Renderer(*values)
+
+
+NCSEnv.renderer_of = staticmethod(_renderer)
 
 register_all()
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 
-from ncs_gym import Ellipsoid, LinearPlant, NCSVectorEnv
+from ncs_gym import LinearPlant, NCSVectorEnv
 from shields import Certificate
-from shields.polytope import Polytope
 from shields.runtime.backup_plans.plan_check import Prediction
 from shields.runtime.backup_plans.plan_search import PlanProgram
 from shields.runtime.safety_filter import SafetyFilter
@@ -95,17 +94,16 @@ class PredictiveFilter:
         require_valid(certificate, plant)
         self._plant, self._fallback, self._horizon = plant, certificate.fallback, horizon
         self._plans = np.empty((0, horizon - 1, plant.m))
-        test, S = certificate_test(certificate, plant), certificate.safe_set
-        self._root, self._ends_in_ellipsoid = test.root, isinstance(S, Ellipsoid)
+        test = certificate_test(certificate, plant)
+        self._root, self._ends_in_ellipsoid = test.root, bool(test.cone)
         self._prediction = Prediction(test, horizon)
         self._program = PlanProgram(self._prediction)
         self._middle, half = _middle_and_half(*plant.kept_ends)
         at_samples = np.tile(half - margin, (horizon + 1, 1))
         self._end_middle, end_half, to_face = np.zeros(1), np.ones(1), np.ones(1)
-        if isinstance(S, Polytope):
-            self._end_middle, end_half = _middle_and_half(S.low, S.high)
-            reached = S.rows @ S.center
-            to_face = np.minimum(S.high - reached, reached - S.low)
+        if not test.cone:
+            self._end_middle, end_half = test.middle[: len(test.root)], test.half[: len(test.root)]
+            to_face = end_half - np.abs(test.root @ certificate.resting_state - self._end_middle)
         self._end_limits = end_half - margin * to_face
         if tube:
             if len(plant.step_rows):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -145,6 +145,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         ValueError: If a setting is of the wrong kind or does not fit the plant.
     """
 
+    renderer_of: ClassVar[Callable[..., Any]]  # set where the package is put together
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": RENDER_FPS}
     observation_space: Box
     action_space: Box
@@ -193,11 +194,7 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
             raise RenderModeError(f"render_mode must be None or one of {RENDER_MODES}, got {shown(render_mode)}")
         self.render_mode = render_mode
-        self.renderer = None
-        if render_mode is not None:
-            from ncs_gym.rendering import Renderer  # imported here: others draw nothing
-
-            self.renderer = Renderer(plant, self._task, render_mode, RENDER_FPS)
+        self.renderer = None if render_mode is None else self.renderer_of(plant, self._task, render_mode, RENDER_FPS)
         self._now = OneLoop(loop)
         self._horizon = as_count(horizon, "horizon", low=1, high=LONGEST_HORIZON)
         self.action_space = Box(-1.0, 1.0, (plant.m,), np.float32)

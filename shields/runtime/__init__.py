@@ -5,6 +5,8 @@ of safety holds, for one loop, or for N, the last axis of all arrays; `safe_loop
 `wrapper` into environments.
 """
 
+from typing import Any
+
 from shields.runtime.safe_loop import SafeLoop
 from shields.runtime.safety_filter import Decision, SafetyFilter
 from shields.runtime.wrapper import SafetyShield, VectorSafetyShield
@@ -16,3 +18,12 @@ __all__ = [
     "SafetyShield",
     "VectorSafetyShield",
 ]
+
+
+def _planner(*values: Any) -> Any:
+    from shields.runtime.backup_plans import Lookahead  # imported here: other modes need no solver
+
+    return Lookahead(*values)
+
+
+SafetyFilter.planner = staticmethod(_planner)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import isnan
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -22,9 +23,6 @@ from shields.runtime.set_test import (
     require_computable,
 )
 from shields.verification import ACTION_ROUNDING, require_valid
-
-if TYPE_CHECKING:
-    from shields.runtime.backup_plans import Lookahead
 
 REASONS = ("safe", "projected", "fallback", "unsafe", "invalid", "planned", "stored")
 SAFE, PROJECTED, FALLBACK, UNSAFE, INVALID, PLANNED, STORED = range(7)
@@ -108,7 +106,8 @@ class SafetyFilter(ReadOnlyArrays):
     mode: str = "project"
     horizon: int | None = None
     test: SetTest = field(init=False, repr=False)
-    lookahead: Lookahead | None = field(init=False, repr=False)
+    lookahead: Any = field(init=False, repr=False)
+    planner: ClassVar[Callable[..., Any]]  # of mode "lookahead": set where the package is put together
     _no_plan: np.ndarray = field(init=False, repr=False)
     _constant: np.ndarray = field(init=False, repr=False)
     _low: np.ndarray = field(init=False, repr=False)
@@ -136,9 +135,7 @@ class SafetyFilter(ReadOnlyArrays):
         object.__setattr__(self, "horizon", horizon)
         object.__setattr__(self, "lookahead", None)
         if horizon is not None:
-            from shields.runtime.backup_plans import Lookahead  # imported here: other modes need no solver
-
-            object.__setattr__(self, "lookahead", Lookahead(self.test, fallback, horizon, MARGIN))
+            object.__setattr__(self, "lookahead", self.planner(self.test, fallback, horizon, MARGIN))
 
     @cached_property
     def _single(self) -> tuple[tuple[int], tuple[int]]:

@@ -57,7 +57,7 @@ def with_limits_out_of_proportion(infeasible: Infeasible, plant: LinearPlant) ->
     of_one_state = (np.count_nonzero(plant.box, axis=1) == 1) & ~plant.is_past_row
     out_of_reach = np.abs(plant.box) @ (FREE_REACH * plant.reach_from_rest) < 1.0
     far = [row_limit(plant, j) for j in np.flatnonzero(of_one_state & out_of_reach).tolist()]
-    if far and infeasible.binding != "E1":  # what lacks an error bound has no set with any limits
+    if far:
         said.append(
             f"inputs and disturbances take no state to a hundredth of {', '.join(far)} in {plant.n} steps: leave out "
             "limits that stand for none"

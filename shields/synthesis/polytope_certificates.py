@@ -121,8 +121,6 @@ def _with_polytope_of(
         except _NOT_CERTIFIED as none:
             failure = failure or none
             progress(f"polytope: {none}")
-            if isinstance(none, Infeasible) and none.binding != "R" and margin == min(MARGINS):
-                break  # a larger margin leaves less
             continue
         try:
             return _verified_polytope(certificate(safe_set=polytope), polytope, plant)
