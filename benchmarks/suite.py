@@ -24,6 +24,7 @@ from agents.loop import LoopConfig
 from benchmarks.commands import run, some_of
 from benchmarks.suite_figures import suite_figures
 from benchmarks.suite_observations import OneErrorSet, Remembered, Shown
+from benchmarks.suite_recurrent import recurrent
 from experiments.analysis.episodes import episodes_table, training_table
 from experiments.analysis.statistics import CONFIDENCE, clopper_pearson
 from experiments.backends.execution import results_of
@@ -62,6 +63,7 @@ class Entry:
         observed: What agents see besides: "disturbance", the estimated one, or "memory"; empty for nothing.
         safe_set: What the shield keeps, "ellipsoid"; empty for the polytope of the others.
         one_error_set: Whether the shield takes every error for one that holds those of all ages.
+        policy: Makes what acts, as of `row_of`; None for the arm's own agents or regulator.
         everywhere: Whether the row is that of all tasks, not only of those in which the network decides.
         seeds: Runs of a block; None for as many as asked for.
     """
@@ -72,6 +74,7 @@ class Entry:
     observed: str = ""
     safe_set: str = ""
     one_error_set: bool = False
+    policy: Callable[[LoopConfig, int], Policy] | None = None
     everywhere: bool = False
     seeds: int | None = None
 
@@ -98,6 +101,7 @@ SECONDARY = {
     "lagrangian:1": Entry("lagrangian:1", seeds=5),
     "unshielded, attacked": Entry("unshielded", attacked=True, seeds=5),
     "shielded, memory": Entry("shielded", observed="memory", seeds=5),
+    "shielded, recurrent": Entry("shielded", policy=recurrent, seeds=5),
 }
 REGULATED = {
     "lqr": Entry("lqr", everywhere=True),
@@ -222,7 +226,11 @@ def quoted(page: str, tables: Mapping[str, str]) -> str:
 
 
 def row_of(
-    task: str, policy: Callable[[LoopConfig, int], Policy], behind: str = "unshielded", block: int = 0
+    task: str,
+    policy: Callable[[LoopConfig, int], Policy],
+    behind: str = "unshielded",
+    block: int = 0,
+    runs: int = SEEDS,
 ) -> dict[str, Any]:
     """Returns the numbers of a policy of one's own on the episodes of a block, as those of the table's rows.
 
@@ -231,8 +239,9 @@ def row_of(
         policy: Makes what acts in a run, given the control loop and the number of the run.
         behind: Arm of `ncs compare` that names a filter: "shielded", "trusting:20", or "unshielded" for none.
         block: The block.
+        runs: How many.
     """
-    settings = _settings(task, block, SEEDS, 1, EPISODES, 1, Path())
+    settings = _settings(task, block, runs, 1, EPISODES, 1, Path())
     loop = loop_config(settings.env)
     certificate, results = certificate_of(loop, None, settings.safe_set), []
     for index in range(settings.seeds):
@@ -280,10 +289,17 @@ def _block(settings: CompareSettings, names: Sequence[str]) -> dict[str, Any]:
             runs.append(_seeing(entry, each, settings) if entry.observed else each)
         return runs
 
+    task, numbers = settings.env.removeprefix("ncs_gym/"), dict[str, Any]()
+    for name in names:
+        entry = ENTRIES[name]
+        if entry.policy is not None:
+            runs = min(settings.seeds, entry.seeds or settings.seeds)
+            numbers[name] = row_of(task, entry.policy, entry.arm, settings.seed, runs)
+    names = [name for name in names if name not in numbers]
     tested = {name: ENTRIES[name] for name in names if ENTRIES[name].tested}
     trained = dict.fromkeys([*(name for name in names if name not in tested), *(each.arm for each in tested.values())])
     first = {name: runs_of(ENTRIES[name], ENTRIES[name].arm) for name in trained}
-    numbers = _judged(first, settings)
+    numbers |= _judged(first, settings)
     second = {
         name: [
             _with_agent(run, settings, agent)
@@ -293,7 +309,7 @@ def _block(settings: CompareSettings, names: Sequence[str]) -> dict[str, Any]:
     }
     for name, found in _judged(second, settings).items():
         numbers[name] = found | {key: numbers[tested[name].arm][key] for key in ("training", "curve")}
-    return {name: numbers[name] for name in names}
+    return numbers
 
 
 def observing(what: str, loop: LoopConfig) -> LoopConfig:
