@@ -47,7 +47,8 @@ pretrained: $(INSTALLED) ## the small agents of the package, trained again
 # What proves, verifies and decides, once more with other kernels of linear algebra and without wide instructions (x86).
 test-other-processor: $(INSTALLED) ## what proves and decides, as on another processor
 	OPENBLAS_CORETYPE=Prescott NPY_DISABLE_CPU_FEATURES='$(WIDE)' $(BIN)/python -m pytest -n auto --dist worksteal \
-		tests/ncs_gym/estimation tests/ncs_gym/plants tests/ncs_gym/uncertainty tests/shields tests/hardening \
+		tests/ncs_gym/estimation tests/ncs_gym/plants tests/ncs_gym/test_ellipsoid.py tests/ncs_gym/test_gaussian_noise.py \
+		tests/ncs_gym/test_disturbances.py tests/ncs_gym/test_vector_disturbances.py tests/shields tests/hardening \
 		--ignore=tests/shields/paper --ignore=tests/hardening/test_bounded_inputs.py
 
 test-lowest: $(LOWEST)/.installed ## the tests, with the lowest versions of dependencies that pyproject.toml allows

@@ -30,7 +30,7 @@ from shields import SafetyShield, synthesize
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("ncs_gym", "shields", "agents", "experiments")
-FEATURES = ("contract", "polytope", "grid", "remainder", "lookahead", "downlink", "ages", "between", "protocol")
+FEATURES = ("contract", "polytope", "remainder", "lookahead", "downlink", "ages", "between", "protocol")
 
 
 def complexity() -> None:
@@ -38,7 +38,7 @@ def complexity() -> None:
 
     Lines of the product, of benchmarks, examples and tests, and of templates and data (those of the report, tuned
     hyperparameters, JSON of the packages but for certificates and trained agents); branches that ask whether a feature
-    is there at all (`x is None` of a contract, a polytope, a grid, a remainder, a plan, a downlink, ages); and calls of
+    is there at all (`x is None` of a contract, a polytope, a remainder, a plan, a downlink, ages); and calls of
     functions of the product in one step of an environment, as it comes and behind a shield whose action passes, and how
     often the module changes from one to the next.
     """
@@ -114,7 +114,7 @@ def step_of(env: gym.Env[Any, Any]) -> Callable[[], Any]:
     return lambda: env.step(action)
 
 
-FOLDERS = ("shields/runtime", "shields/verification", "ncs_gym/estimation", "ncs_gym/network")
+FOLDERS = ("shields/runtime", "shields/verification", "ncs_gym/estimation", "ncs_gym/network", "ncs_gym/ellipsoid.py")
 SWAPPED: dict[type, type] = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -192,7 +192,7 @@ def _swapped(operators: list[ast.cmpop], index: int) -> str:
 
 def candidates(folder: str) -> Iterator[Mutant]:
     """Yields every mutant of a folder: what is computed, not annotations, messages of errors or imports."""
-    for path in sorted((ROOT / folder).rglob("*.py")):
+    for path in sorted((ROOT / folder).rglob("*.py")) or [ROOT / folder]:
         tree = ast.parse(path.read_text())
         left_out = {id(inner) for node in ast.walk(tree) for part in _not_computed(node) for inner in ast.walk(part)}
         for number, node in enumerate(ast.walk(tree)):
@@ -230,7 +230,8 @@ def fate(stages: int, mutant: Mutant) -> str:
                 shutil.copyfile(ROOT / name, copied / name)
         (copied / mutant.file).write_text(mutant.source)
         package, *inner = Path(mutant.file).parts[:-1]
-        for tests in (f"tests/{package}/{inner[-1]}", f"tests/{package}", "tests")[:stages]:
+        nearest = inner[-1] if inner else f"test_{Path(mutant.file).name}"
+        for tests in (f"tests/{package}/{nearest}", f"tests/{package}", "tests")[:stages]:
             if (copied / tests).exists() and (noticed := _first_failure(copied, tests)):
                 return noticed
     return ""
@@ -255,9 +256,9 @@ def mutants(count: int = 60, jobs: int = 2, only: Sequence[int] = (), stages: in
     """So many small faults in what guarantees rest on, and the test of `make test` that notices each.
 
     A mutant is the program with one operator, comparison, condition or number changed. They are spread evenly over
-    shields/runtime, shields/verification, ncs_gym/estimation and ncs_gym/network, always the same ones for the same
-    source. Tests run in a copy of the repository, those of the same folder first, until one fails. What survives either
-    needs a test or changes nothing (a constant that is larger than it must be, a search that is checked afterwards).
+    `FOLDERS`, always the same ones for the same source. Tests run in a copy of the repository, those of the same folder
+    first, until one fails. What survives either needs a test or changes nothing (a constant that is larger than it must
+    be, a search that is checked afterwards).
     --only are numbers of mutants; --stages is 1 for tests of the same folder, 2 of the package, 3 for all; --list names
     the mutants and runs nothing.
     """

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
 from pathlib import Path
+from textwrap import fill
 from typing import Annotated, Any
 
 import numpy as np
@@ -43,9 +44,18 @@ ROOT = Path(__file__).resolve().parents[1]
 MEASURED, NUMBERS, PAGE = Path("runs/suite/numbers.json"), Path("docs/results.json"), Path("docs/benchmark.md")
 # Runs of a primary arm and block, steps of a training, and episodes of a run in each scenario.
 SEEDS, STEPS, EPISODES = 10, 60_000, 25
-# Tasks in which the network decides, and others.
-NETWORK_TASKS = ("CSTR-v0", "Convoy-v0", "LaneKeeping-v0")
-OTHER_TASKS = ("TruckTrailerCruise-v0", "TruckTrailer-v0", "BatchReactor-v0", "CartPole-v0")
+# Tasks in which the network decides, and others, each with why it is there.
+NETWORK_TASKS = {
+    "CSTR-v0": "an unstable reactor that is asked to go near its limits, of a common textbook model",
+    "Convoy-v0": "the commonest plant of networked control, two integrators, whose disturbance persists",
+    "LaneKeeping-v0": "the same with a narrow box: late samples cost more than lost ones",
+}
+OTHER_TASKS = {
+    "TruckTrailerCruise-v0": "the paper's plant, whose agents drive a speed profile",
+    "TruckTrailer-v0": "the paper's plant, an unloaded truck at rest: what a shield costs where it is not needed",
+    "BatchReactor-v0": "two inputs and two measured states of four, unstable",
+    "CartPole-v0": "the usual unstable plant of reinforcement learning, linear, with full actions",
+}
 TASKS = (*NETWORK_TASKS, *OTHER_TASKS)
 
 ATTACKED, IDEAL = "attacked", "attacked on an ideal channel"
@@ -230,7 +240,7 @@ def row_of(
     policy: Callable[[LoopConfig, int], Policy],
     behind: str = "unshielded",
     block: int = 0,
-    runs: int = SEEDS,
+    runs: int | None = None,
 ) -> dict[str, Any]:
     """Returns the numbers of a policy of one's own on the episodes of a block, as those of the table's rows.
 
@@ -239,9 +249,9 @@ def row_of(
         policy: Makes what acts in a run, given the control loop and the number of the run.
         behind: Arm of `ncs compare` that names a filter: "shielded", "trusting:20", or "unshielded" for none.
         block: The block.
-        runs: How many.
+        runs: How many, by default as many as of the primary arms.
     """
-    settings = _settings(task, block, runs, 1, EPISODES, 1, Path())
+    settings = _settings(task, block, runs or SEEDS, 1, EPISODES, 1, Path())
     loop = loop_config(settings.env)
     certificate, results = certificate_of(loop, None, settings.safe_set), []
     for index in range(settings.seeds):
@@ -568,6 +578,31 @@ def tasks_table(_: dict[str, Any]) -> str:
     return text_table(rows, rules=(2,))
 
 
+def tasks_in_full() -> str:
+    """Returns all that a task consists of, and why it is one."""
+    texts = []
+    for task, reason in (NETWORK_TASKS | OTHER_TASKS).items():
+        loop = loop_config(f"ncs_gym/{task}")
+        attacked: Any = under(ATTACKED, loop).vector(1).unwrapped
+        env, worse = registered_env(loop.env), attacked.single
+        ends = "end with a violation" if env.terminate_on_violation else "go on after a violation"
+        rows = {
+            "network": env.channel,
+            "contract": env.contract,
+            "disturbance": f"{env.disturbance}, {env.noise} noise",
+            "attacked": f"{worse.disturbance}, {worse.noise} noise, {worse.channel}",
+            "reward": env.task,
+            "episodes": f"{loop.episode_steps} steps, {ends}",
+            "chosen": reason,
+        }
+        own = "\n".join(
+            fill(str(value), 80, initial_indent=f"{name:<16}", subsequent_indent=" " * 16)
+            for name, value in rows.items()
+        )
+        texts.append(f"{task}, plant {env.plant.fingerprint[:16]}\n{env.plant}\n{own}")
+    return "\n\n".join(texts)
+
+
 TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "budget": budget_text,
     "tasks": tasks_table,
@@ -585,7 +620,8 @@ def quotable(found: dict[str, Any]) -> dict[str, str]:
 
 def all_tables(found: dict[str, Any]) -> str:
     """Returns all tables as plain text."""
-    return "\n\n\n".join(f"{name}\n{table}" for name, table in quotable(found).items()) + "\n"
+    tables = [f"{name}\n{table}" for name, table in quotable(found).items()]
+    return "\n\n\n".join([*tables, tasks_in_full()]) + "\n"
 
 
 COMMANDS = (measure, replicate, pages)

@@ -1,4 +1,4 @@
-"""Sets of what is uncertain: ellipsoids by their shape, points of their sums, and truncated Gaussian noise."""
+"""Ellipsoids by their shape, points of their sums, the test of a residual, and truncated Gaussian noise."""
 
 from __future__ import annotations
 

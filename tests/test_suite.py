@@ -12,7 +12,6 @@ from benchmarks.suite import (
     ATTACKED,
     ENTRIES,
     IDEAL,
-    NETWORK_TASKS,
     PRIMARY,
     SWITCHES,
     TASKS,
@@ -106,7 +105,7 @@ def test_every_impairment_keeps_the_contract_and_has_what_is_on(task):
 @pytest.mark.slow
 def test_a_small_suite_keeps_its_runs_trains_once_and_nothing_breaks_the_shield(tmp_path):
     def made(*names, **changed):
-        settings = {"tasks": NETWORK_TASKS[:1], "arms": names, "seeds": 2, "steps": 1500, "episodes": 40}
+        settings = {"tasks": TASKS[:1], "arms": names, "seeds": 2, "steps": 1500, "episodes": 40}
         suite.measure(**settings | changed, jobs=1, out=tmp_path / "out", numbers=tmp_path / "numbers.json")
         return json.loads((tmp_path / "numbers.json").read_text())
 

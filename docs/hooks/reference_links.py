@@ -9,7 +9,7 @@ from typing import Any
 FOLDERS = ("api/", "environments/")
 # What stays as it is: programs and signatures, links, headings, names of arguments.
 _KEPT = r"<pre\b.*?</pre>|<a\b.*?</a>|<h\d\b.*?</h\d>|<b>.*?</b>"
-# A page in a docstring: docs/theory.md section 3, or docs/shield_proof.md, "Rounding".
+# A page in a docstring: docs/shield_proof.md section 3, or docs/shield_proof.md, "Rounding".
 _PAGE = (
     r'(?:<code>)?(?:docs/)?(?P<page>[a-z]\w*)\.md(?:</code>)?(?:\s+sections?\s+(?P<number>\d)|,\s+"(?P<title>[^"<]+)")?'
 )

@@ -1,4 +1,4 @@
-"""The delay-aware Kalman filter with a running hard ellipsoid around its error, of one loop and of N."""
+"""The delay-aware Kalman filter with a running hard ellipsoid around its error, of one loop and of N; the belief."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """The network between sensor and controller, and between controller and actuator.
 
-`channel` has the settings, `packet_loss_and_delay` what happens to packets during an episode, `contract` what a channel
-promises; `downlink` is the way of the commands, `actuator` their end; `packet_log` is a record of packets.
+`channel` has the settings and what a channel promises, `packet_loss_and_delay` what happens to packets during an
+episode; `requests` are samples asked for; `downlink` is the way of the commands, with the actuator at its end;
+`packet_log` is a record of packets.
 """

@@ -1,4 +1,4 @@
-"""The settings of a network between sensor and controller: loss, send period, quantization and delay; packets."""
+"""The settings of a network between sensor and controller, its packets, and what a channel promises."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Filter and monitor of a loop, or of N: what is applied in place of what is proposed, and what is proved of it."""
+"""Filter and monitor of a loop, or of N: what is applied in place of what is proposed, what is proved, why not."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NO_DOWNLINK_CONTRACT = "the downlink has no contract: nothing says that inputs a
 # Of loops that learn from echoes what was applied; no monitor says so.
 NOT_CONFIRMED = "the actuator has not confirmed for too long that it applies what is decided"
 OTHER_EPISODE = "the actuator echoes inputs of another episode: tell it the episode of the loop"
-# Codes of `GuaranteeMonitor.reasons` (`guard`); 0 while the proof holds.
+# Codes of `GuaranteeMonitor.reasons`; 0 while the proof holds.
 EXPLANATIONS = (
     "", ALARM, OTHER_INPUT, OTHER_STEPS, LARGE_ERROR, FAR_OUT, UNUSABLE, NOT_KNOWN_INSIDE,
     LEFT_MODEL, LATE_INPUT, NO_DOWNLINK_CONTRACT, OLD_SAMPLE, NOT_CONFIRMED, NOT_FINITE,
@@ -442,7 +442,7 @@ class GuaranteeMonitor:
         if inside is not True and not _all(inside):
             # A stored plan was certified for every error that it can meet: it needs no certified error set on its way.
             inside = inside | state.inside & (state.certified & decision.fallback | decision.stored)
-        # A passed test proves the times on the grid and the next state; the first one needs x itself in the box.
+        # A passed test proves the limits within the step and the next state; the first one needs x itself in the box.
         on_the_way = inside & state.inside if self._within_step else True
         return self._observe(broken, inside, belief, errors, state.wait, on_the_way)
 

@@ -1,4 +1,4 @@
-"""Matrices of rational numbers: every float is a dyadic rational, so their arithmetic has no rounding."""
+"""Matrices of rational numbers, and conditions they decide: every float is rational, so nothing rounds."""
 
 from __future__ import annotations
 

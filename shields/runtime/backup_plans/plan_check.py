@@ -126,7 +126,7 @@ class PlanTest:
         np.logical_and.accumulate(in_box[:-1], axis=0, out=on_the_way[1:])
         kept &= on_the_way
         if tightening.between.size:
-            kept &= prediction.grid.keeps(estimates, tightening.between, plans, self._margin)
+            kept &= prediction.within.keeps(estimates, tightening.between, plans, self._margin)
         within = np.all((plant.input_ends[0] <= plans) & (plans <= plant.input_ends[1]), axis=-1)
         return np.logical_and.accumulate(within, axis=-1) & kept.transpose(1, 2, 0)
 
@@ -174,7 +174,7 @@ class Prediction:
         rows: Rows whose values at the centers are judged, shape (r, n): the k rows of the box, and where plans end in P
             its others.
         middle, half: Of the ends of these rows, shape (r,); the half is less by the rounding of both.
-        grid: What is asked within steps.
+        within: What is asked within steps.
         powers, sizes: A^j and |A|^j for j = 0..N, shape (N + 1, n, n).
         forced: Block rows [A^{j-1} B, ..., B, 0, ...], shape (N, n, N m).
         size_forced: sum_{i<j} |A|^i |B| |u| for the largest |u| within the limits, shape (N, n).
@@ -208,7 +208,7 @@ class Prediction:
         self.size_forced = read_only(np.cumsum(pushes, axis=0))
         self.rounding = read_only(8.0 * (n + m) * (np.arange(1, steps + 1) + 2.0) * float(np.finfo(float).eps))
         self.ends = tuple(End.after(j + 1, self) for j in range(steps)) if first.cone else ()
-        self.grid = PlanGrid(self)
+        self.within = RowsWithinSteps(self)
         self._free = self.powers[1:].reshape(steps * n, n)
         self._forced = self.forced.reshape(steps * n, steps * m)
 
@@ -220,7 +220,7 @@ class Prediction:
         return moved.reshape(self.steps, self.plant.n, count, number)
 
 
-class PlanGrid:
+class RowsWithinSteps:
     """The plant's `step_rows` in every step of a plan, i = 0..N-1: row (c_i, u_i) +- rho_i is between its ends.
 
     Attributes:
@@ -328,7 +328,7 @@ class Tightening(NamedTuple):
             |T G c_j| is at most the radius. Of shape (E, N, 0, n) where plans end in P.
         radius: 1 - h less the rounding that does not depend on the estimate, shape (E, N); 1 where plans end in P; NaN
             for an unusable shape.
-        between: `PlanGrid.row_limits`, shape (E, N, g).
+        between: `RowsWithinSteps.row_limits`, shape (E, N, g).
     """
 
     row_limits: np.ndarray
@@ -353,7 +353,7 @@ def tightenings(prediction: Prediction, shapes: np.ndarray) -> Tightening:
     symmetric = 0.5 * (shapes + shapes.swapaxes(1, 2))
     reach = (_supports(rows[1:], sizes[1:], symmetric, rounding) + np.cumsum(added, axis=0)) * (1.0 + rounding)
     pushed = rounding * (prediction.size_forced @ np.abs(prediction.rows).T)
-    between = prediction.grid.row_limits(symmetric)
+    between = prediction.within.row_limits(symmetric)
     judged, usable, _ = judged_shapes(shapes, shapes[:0])
     if prediction.ends:
         found = [end.ball(judged) for end in prediction.ends]

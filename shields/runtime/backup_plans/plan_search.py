@@ -262,12 +262,12 @@ class PlanProgram:
         self._G = prediction.rows[:0] if prediction.ends else prediction.rows
         steady = np.tile(self._middle, length)
         self._pushed = read_only(prediction.forced @ steady)
-        middle, grid = prediction.middle, prediction.grid
-        middles = [np.tile(middle[: len(self._C)], length - 1), middle[: len(self._G)], np.tile(grid.middle, length)]
-        middles[2] = middles[2] - (grid.forced @ steady).ravel()
+        middle, within = prediction.middle, prediction.within
+        middles = [np.tile(middle[: len(self._C)], length - 1), middle[: len(self._G)], np.tile(within.middle, length)]
+        middles[2] = middles[2] - (within.forced @ steady).ravel()
         self._middles = read_only(np.concatenate(middles))
-        self._between = prediction.grid.free.reshape(-1, plant.n)
-        between = (prediction.grid.forced * scale).reshape(-1, len(scale))
+        self._between = prediction.within.free.reshape(-1, plant.n)
+        between = (prediction.within.forced * scale).reshape(-1, len(scale))
         rows = np.concatenate([(self._C @ forced).reshape(-1, len(scale)), self._G @ self._end, between])
         self._rows = read_only(np.concatenate([rows, -rows]))
         self._margin = SOLVER_MARGIN + float(ACTION_ROUNDING) * np.abs(rows).sum(axis=1)
@@ -314,7 +314,7 @@ class PlanProgram:
             row_limits: Largest distance of row c_j from its middle for j = 1..N, shape (N, r).
             weighting: T G of the last step, shape (n, n), or (0, n) for an end in P.
             radius: Largest |T G c_j| of the last step.
-            between: Largest distances of the rows of the grid from their middles in every step, shape (N, g).
+            between: Largest distances of the rows within a step from their middles in every step, shape (N, g).
             proposed: Shape (m,).
         """
         centers = self._free @ estimate + self._pushed

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ncs_gym import Channel, Packet
-from ncs_gym.ellipsoid import outside_sum
-from ncs_gym.estimation.estimator import ALARM_TOLERANCE
+from ncs_gym.ellipsoid import ALARM_TOLERANCE, outside_sum
 from ncs_gym.estimation.kalman_filter import ErrorRecursion, ErrorStatistics
 from ncs_gym.plants.linear_plant import LinearPlant
 
