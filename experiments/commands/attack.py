@@ -21,6 +21,7 @@ from ncs_gym.registration import EPISODE_STEPS, registered_ids
 from ncs_gym.validation import counted
 from shields import Certificate, VectorSafetyShield, certificate_for
 from shields.polytope import Polytope
+from shields.runtime.safety_filter import Mode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,7 @@ class AttackSettings:
 
     env: str | None = None
     steps: int = 1_000_000
-    mode: Literal["project", "lookahead", "switch", "boundary", "monitor"] = "project"
+    mode: Mode = "project"
     safe_set: Literal["polytope", "ellipsoid"] | None = None
     horizon: int | None = None
     out: Path | None = None

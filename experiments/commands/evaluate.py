@@ -21,6 +21,7 @@ from experiments.settings import Assignments, id_alone, require_horizon, require
 from experiments.terminal import wrapped
 from ncs_gym.envs.env import ncs_env
 from ncs_gym.validation import counted
+from shields.runtime.safety_filter import Mode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +44,7 @@ class EvaluateSettings:
 
     model: tyro.conf.Positional[Path]
     env: str | None = None
-    shield: Literal["as-trained", "none", "monitor", "project", "lookahead", "switch", "boundary"] = "as-trained"
+    shield: Literal["as-trained", "none", Mode] = "as-trained"
     horizon: int | None = None
     episodes: int = 200
     seed: int = 0

@@ -23,6 +23,7 @@ from ncs_gym.rendering import theme
 from ncs_gym.validation import counted
 from shields import Certificate, SafetyShield
 from shields.documents import write_atomically
+from shields.runtime.safety_filter import Mode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ class RenderSettings:
     env: str = "ncs_gym/TruckTrailerCruise-v0"
     out: Path = Path("episode.gif")
     policy: str = "lqr"
-    shield: Literal["project", "lookahead", "switch", "boundary", "monitor", "none"] = "project"
+    shield: Literal[Mode, "none"] = "project"
     horizon: int | None = None
     side_by_side: bool = False
     certificate: Path | None = None

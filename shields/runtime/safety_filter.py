@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import isnan
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -27,7 +27,8 @@ from shields.verification import ACTION_ROUNDING, require_valid
 REASONS = ("safe", "projected", "fallback", "unsafe", "invalid", "planned", "stored")
 SAFE, PROJECTED, FALLBACK, UNSAFE, INVALID, PLANNED, STORED = range(7)
 NO_PLAN = read_only(np.empty((0, 0)))
-MODES = ("project", "switch", "boundary", "monitor", "lookahead")
+Mode = Literal["project", "lookahead", "switch", "boundary", "monitor"]
+MODES = get_args(Mode)
 # Longest plan of mode "lookahead", in steps, where none is given, and the longest there is.
 DEFAULT_HORIZON, LONGEST_HORIZON = 6, 50
 # The test must be passed by this much, in units of the safe set: far more than the rounding of its computation.
