@@ -80,7 +80,10 @@ class Faces:
 
 def region_of(safe_set: Any) -> Ball | Faces:
     """The safe set of a certificate as the adversary sees it."""
-    return Faces(safe_set.rows) if hasattr(safe_set, "rows") else Ball(safe_set.shape_matrix)
+    if not hasattr(safe_set, "rows"):
+        return Ball(safe_set.shape_matrix)
+    assert np.array_equal(safe_set.low, -safe_set.high)
+    return Faces(safe_set.rows / safe_set.high[:, None])
 
 
 def box_of(plant: Any) -> Faces:
