@@ -237,8 +237,7 @@ class SetTest:
         first = len(self.root)
         rounding = self.rounding * float(self.columns.dot(np.abs(estimate)))
         values = self.state_rows[first:].dot(estimate)
-        middle, row_limits = self.middle[first - self.cone :], errors.row_limits[first - self.cone :]
-        return bool((np.abs(values - middle) <= row_limits - rounding - margin).all())
+        return bool((np.abs(values - self.middle[first:]) <= errors.row_limits[first:] - rounding - margin).all())
 
 
 class ReachableSets(NamedTuple):
