@@ -71,29 +71,6 @@ def _exponent(size: float) -> int:
     return int(f"{size:e}".partition("e")[2])
 
 
-def largest_eigenvalue(symmetric: np.ndarray) -> float:
-    """Returns the smallest float64 that no eigenvalue of a semidefinite float matrix exceeds."""
-    low, high = float(np.diag(symmetric).max()), math.nextafter(total(np.diag(symmetric)), math.inf)
-    matrix = _rational(symmetric)
-    if _bounds(low, matrix):
-        return low
-    while low < (middle := 0.5 * (low + high)) < high:
-        low, high = (low, middle) if _bounds(middle, matrix) else (middle, high)
-    return high
-
-
-def _bounds(number: float, matrix: Any) -> bool:
-    """Returns whether no eigenvalue of a symmetric rational matrix exceeds a number.
-
-    Those of number I - matrix are not negative exactly if the coefficients of its characteristic polynomial alternate.
-    """
-    size = matrix.nrows()
-    identity = fmpq_mat(size, size, [int(i == j) for i in range(size) for j in range(size)])
-    whole, _ = (_as_rational(number) * identity - matrix).numer_denom()
-    coefficients = reversed(whole.charpoly().coeffs())
-    return all(entry * (-1) ** power >= 0 for power, entry in enumerate(coefficients))
-
-
 def exponential(generator: np.ndarray, time: float) -> np.ndarray:
     """Returns exp(G t) of a float matrix G, shape (n, n), every entry rounded once."""
     exact = _rational(generator) * _as_rational(time)

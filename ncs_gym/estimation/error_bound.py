@@ -32,12 +32,12 @@ class ErrorSet(ReadOnlyArrays):
 
     Of a stable plant without a contract that is one set for every age, and no packet has to arrive:
 
-        (E0) Sigma >= r0^2 I
+        (E0) Sigma >= X0
         (E1) Sigma >= A Sigma A'/lam + D/(1 - lam)
 
     Under a contract with the largest age h they are h + 2 (docs/shield_proof.md, "Channel contracts"):
 
-        (C0) Sigma_0 >= r0^2 I
+        (C0) Sigma_0 >= X0
         (C1) Sigma_{j+1} >= A Sigma_j A'/lam_j + D/(1-lam_j)                             j = 0..h
         (C2) Sigma_0 >= (I-T_j H) Sigma_j (I-T_j H)'/mu_j + T_j N T_j'/(1-mu_j)          j = 1..h+1
 
@@ -171,7 +171,7 @@ LARGEST = 1e6
 def _iterated_sets(plant: LinearPlant, contract: ChannelContract) -> ErrorSet:
     """Returns error sets by age.
 
-    From Sigma_0 = r0^2 I: carry it through the longest gap, update after every possible gap with the set-membership
+    From Sigma_0 = X0: carry it through the longest gap, update after every possible gap with the set-membership
     gain, and let Sigma_0 be the smallest ellipsoid around the results that pairwise joins give; until it holds what
     comes of it, which is (C0), (C1) and (C2). Shares minimize traces weighted with what errors cost.
     """

@@ -171,7 +171,7 @@ class Estimator(PastSteps):
         self._begin(np.zeros(plant.n))
 
     def reset(self, mean: np.ndarray) -> None:
-        """Starts the next episode, or episode 0 at first, with an estimate, shape (n,), whose error is in E(r0^2 I)."""
+        """Starts the next episode, or episode 0 at first, with an estimate, shape (n,), whose error is in E(X0)."""
         self.episode += not self._is_new
         self._is_new = False
         self.histories = self._usual

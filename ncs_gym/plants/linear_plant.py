@@ -455,16 +455,9 @@ class LinearPlant(LimitValues):
         return Ellipsoid(inflated(ellipsoid_around_sum(np.eye(self.p), ball, self.nominal_sensor_error).shape_matrix))
 
     @cached_property
-    def initial_radius_squared(self) -> float:
-        """r0^2 = lambda_max(P0) chi2_{n,1-delta}: the truncated first error is no longer than r0."""
-        return max(exact.largest_eigenvalue(self.initial_noise.bound.shape_matrix), 0.0)
-
-    @cached_property
     def nominal_initial_error(self) -> Ellipsoid:
-        """Holds the error of the first estimate before inflation: the ball of r0 plus `initial_bound`."""
-        unknown = np.arange(self.n) < self.n - self.past
-        ball = Ellipsoid(self.initial_radius_squared * np.diag(unknown.astype(float)))
-        return ellipsoid_around_sum(self.relative_weight, ball, self.initial_bound)
+        """Holds the error of the first estimate before inflation."""
+        return self.of_first_error.around(self.relative_weight)
 
     @cached_property
     def initial_error(self) -> Ellipsoid:

@@ -78,7 +78,7 @@ def _multiplier_conditions(certificate: Certificate) -> Iterator[Condition]:
 
 
 def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
-    """Checks that D, N and r0^2 I contain what docs/shield_proof.md, "Setting", says they contain."""
+    """Checks that D, N and X0 contain what docs/shield_proof.md, "Setting", says they contain."""
     ball = scale(Fraction(plant.gamma), rational(np.eye(plant.n)))
     noise = scale(Fraction(plant.process_noise.energy), rational(plant.process_noise_cov))
     weight = rational(plant.relative_weight)
@@ -98,9 +98,10 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
         required = _sum_bound(scale(plant.p * step * step / 4, identity), sensor, identity)
         difference = subtract(rational(certificate.updates.noise), required)
         yield matrix_condition("N: holds the sensor noise and the quantization error", difference)
-    first = _first_error(plant, weight)
+    first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
+    first = _with_declared(first, plant.initial_bound, weight)
     yield matrix_condition(
-        "r0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape_matrix), first)
+        "X0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape_matrix), first)
     )
 
 
@@ -116,30 +117,13 @@ def _restlessness(certificate: Certificate, plant: LinearPlant) -> Matrix:
     return [[a * b for b in r] for a in r]
 
 
-def _first_error(plant: LinearPlant, weight: Matrix) -> Matrix:
-    """Returns a shape that holds the truncated first error plus the declared one.
-
-    Its multiplier is the one that is best for the ball of radius r0, with which the plant's own bound is made; any
-    multiplier proves containment.
-    """
-    noise = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
-    if plant.initial_bound is None:
-        return noise
-    declared = rational(plant.initial_bound.shape_matrix)
-    ball = scale(Fraction(plant.initial_radius_squared), rational(np.eye(plant.n)))
-    if not (any(map(any, noise)) and any(map(any, declared))):
-        return add(noise, declared)
-    nu = _smallest_trace_multiplier(ball, declared, weight)
-    return add(scale(1 / nu, noise), scale(1 / (1 - nu), declared))
-
-
 def _error_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks (E0) and (E1), or (C0), (C1) and (C2): the estimation error is always in the set of its age."""
     D, A = rational(certificate.D), rational(plant.A)
     shapes = [rational(proof.Sigma) for proof in certificate.proofs]
     next_shapes = [rational(shape) for shape in certificate.next_error_shapes]
     is_by_age = certificate.updates is not None
-    name = "(C0) Sigma_0 - r0^2 I >= 0" if is_by_age else "(E0) Sigma - r0^2 I >= 0"
+    name = "(C0) Sigma_0 - X0 >= 0" if is_by_age else "(E0) Sigma - X0 >= 0"
     yield matrix_condition(name, subtract(shapes[0], rational(plant.initial_error.shape_matrix)))
     for j, (proof, Sigma, following) in enumerate(zip(certificate.proofs, shapes, next_shapes, strict=True)):
         lam = Fraction(proof.rate)

@@ -53,7 +53,7 @@ def _line(alike: list[Condition]) -> str:
 def verify(certificate: Certificate, plant: LinearPlant) -> Report:
     """Returns whether a certificate proves what it claims for a plant, in exact rational arithmetic.
 
-    The conditions are those of docs/shield_proof.md, and that D, N and r0^2 I contain what its "Setting" says. Neither
+    The conditions are those of docs/shield_proof.md, and that D, N and X0 contain what its "Setting" says. Neither
     a tolerance nor a solver nor a float decides; the margins are for people.
 
     Raises:

@@ -62,19 +62,6 @@ def test_model_that_comes_to_rest_within_a_step_is_sampled():
         assert (A.item(), B.item()) == (0.0, 1.0 / size)  # as rational numbers these would fill the memory
 
 
-@pytest.mark.parametrize("n", [1, 2, 4])
-def test_largest_eigenvalue_is_numpys_to_its_rounding(n):
-    root = RNG.standard_normal((n, n))
-    symmetric = root @ root.T
-    symmetric = 0.5 * (symmetric + symmetric.T)
-    assert exact.largest_eigenvalue(symmetric) == pytest.approx(np.linalg.eigvalsh(symmetric)[-1], rel=1e-12)
-    assert exact.largest_eigenvalue(np.diag([1.0, 3.0, 2.0])) == 3.0
-    assert exact.largest_eigenvalue(np.array([[2.0, 1.0], [1.0, 2.0]])) == 3.0
-    close = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 1e-300], [0.0, 1e-300, 2.0]])
-    assert exact.largest_eigenvalue(close) == np.nextafter(2.0, 3.0)
-    assert exact.largest_eigenvalue(np.zeros((2, 2))) == 0.0
-
-
 def test_rounding_keeps_digits_of_the_largest_number():
     np.testing.assert_array_equal(exact.rounded(np.array([123.456, 0.0123, -1e-9]), 4), [123.5, 0.0, 0.0])
     np.testing.assert_array_equal(

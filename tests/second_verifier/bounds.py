@@ -1,4 +1,4 @@
-"""Whether the sets D, N and r0^2 I of a plant hold what was declared of it (docs/shield_proof.md, "Setting")."""
+"""Whether the sets D, N and X0 of a plant hold what was declared of it (docs/shield_proof.md, "Setting")."""
 
 from __future__ import annotations
 
@@ -52,9 +52,8 @@ def bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
         box = plant.p * step * step / 4 * identity(plant.p)  # in the ball around the box of |v_i| <= step/2
         sensed.append(_part(box, quantizer))
         yield _holds_sum("N: holds the sensor noise and the quantization error", matrix(updates.noise), sensed)
-    radius = _part(number(plant.initial_radius_squared) * identity(plant.n), weight).size
-    first = [_noise(plant.initial_noise, weight)._replace(size=radius), _declared(plant.initial_bound, weight)]
-    yield _holds_sum("r0: holds the error of the first estimate", matrix(plant.initial_error.shape_matrix), first)
+    first = [_noise(plant.initial_noise, weight), _declared(plant.initial_bound, weight)]
+    yield _holds_sum("X0: holds the error of the first estimate", matrix(plant.initial_error.shape_matrix), first)
     for what, noise in (
         ("process noise", plant.process_noise),
         ("sensor noise", plant.sensor_noise),

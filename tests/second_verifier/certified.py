@@ -101,11 +101,11 @@ def _error_conditions(certificate: Certificate, D: Any, plant: LinearPlant) -> I
     sets, rates = [matrix(proof.Sigma) for proof in certificate.proofs], [proof.rate for proof in certificate.proofs]
     start = sets[0] - matrix(plant.initial_error.shape_matrix)
     if updates is None:
-        yield definite("(E0) Sigma - r0^2 I >= 0", start)
+        yield definite("(E0) Sigma - X0 >= 0", start)
         name = "(E1) Sigma - A Sigma A'/lam_e - D/(1-lam_e) >= 0"
         yield _holds_next(name, sets[0], A, sets[0], D, number(rates[0]))
         return
-    yield definite("(C0) Sigma_0 - r0^2 I >= 0", start)
+    yield definite("(C0) Sigma_0 - X0 >= 0", start)
     sets.append(matrix(updates.last))
     for age, rate in enumerate(rates):
         name = f"(C1) Sigma_{age + 1} - A Sigma_{age} A'/lam - D/(1-lam) >= 0"

@@ -70,7 +70,7 @@ def test_first_error_that_misses_a_bound_declared_beside_a_covariance_makes_a_ce
     certificate = certificate_of(plant)
     assert verified(certificate, plant).valid
     larger = replaced(plant, initial_bound=Ellipsoid(1.001 * plant.initial_bound.shape_matrix))
-    assert [name[:3] for name in broken(certificate, larger)] == ["r0:"]
+    assert [name[:3] for name in broken(certificate, larger)] == ["X0:"]
 
 
 def test_paper_certificate_proves_nothing_of_bounds_that_its_theorems_do_not_know():
