@@ -79,11 +79,11 @@ class Faces:
 
 
 def region_of(safe_set: Any) -> Ball | Faces:
-    """The safe set of a certificate as the adversary sees it."""
+    """The safe set of a certificate as the adversary sees it; ends that differ it is given besides."""
     if not hasattr(safe_set, "rows"):
         return Ball(safe_set.shape_matrix)
-    assert np.array_equal(safe_set.low, -safe_set.high)
-    return Faces(safe_set.rows / safe_set.high[:, None])
+    half = np.where(safe_set.low == -safe_set.high, safe_set.high, 1.0)
+    return Faces(safe_set.rows / half[:, None])
 
 
 def box_of(plant: Any) -> Faces:
