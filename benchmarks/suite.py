@@ -46,15 +46,15 @@ MEASURED, NUMBERS, PAGE = Path("runs/suite/numbers.json"), Path("docs/results.js
 SEEDS, STEPS, EPISODES = 10, 60_000, 25
 # Tasks in which the network decides, and others, each with why it is there.
 NETWORK_TASKS = {
-    "CSTR-v0": "an unstable reactor that is asked to go near its limits, of a common textbook model",
-    "Convoy-v0": "the commonest plant of networked control, two integrators, whose disturbance persists",
-    "LaneKeeping-v0": "the same with a narrow box: late samples cost more than lost ones",
+    "CSTR-v0": "a reactor at an unstable point (Seborg et al. 2016), asked to go near its limit",
+    "Convoy-v0": "a vehicle with a lagging drive, pushed for long by the leader's speed",
+    "LaneKeeping-v0": "an integrator of an integrator in a narrow lane, pushed by side wind",
 }
 OTHER_TASKS = {
-    "TruckTrailerCruise-v0": "the paper's plant, whose agents drive a speed profile",
-    "TruckTrailer-v0": "the paper's plant, an unloaded truck at rest: what a shield costs where it is not needed",
-    "BatchReactor-v0": "two inputs and two measured states of four, unstable",
-    "CartPole-v0": "the usual unstable plant of reinforcement learning, linear, with full actions",
+    "TruckTrailerCruise-v0": "the paper's plant, loaded, following a profile of speeds",
+    "TruckTrailer-v0": "the paper's plant as it is there, at which nobody violates",
+    "BatchReactor-v0": "unstable, with two inputs, four states and two outputs",
+    "CartPole-v0": "the unstable plant of many papers on learning, linear, with full states",
 }
 TASKS = (*NETWORK_TASKS, *OTHER_TASKS)
 
@@ -589,7 +589,7 @@ def tasks_in_full() -> str:
         rows = {
             "network": env.channel,
             "contract": env.contract,
-            "disturbance": f"{env.disturbance}, {env.noise} noise",
+            "simulated": f"{env.disturbance}, {env.noise} noise",
             "attacked": f"{worse.disturbance}, {worse.noise} noise, {worse.channel}",
             "reward": env.task,
             "episodes": f"{loop.episode_steps} steps, {ends}",

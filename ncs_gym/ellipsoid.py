@@ -458,7 +458,10 @@ def quick_test(spread: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 
 def outside_sum(points: np.ndarray, first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
-    """Returns which points, (k, p), lie outside E(P1) + E(P2), P2 > 0, by more than a relative tolerance, (k,)."""
+    """Returns which points, (k, p), lie outside E(P1) + E(P2), P2 > 0, by more than a relative tolerance, (k,).
+
+    While the assumptions hold, a residual y - H x_hat lies in E(H Sigma_k H') + E(N).
+    """
     axes, values = common_axes(first, second)
     return outside_sum_in_axes(np.square(axes @ points.T), values[:, None], tolerance)
 

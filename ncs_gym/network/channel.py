@@ -25,6 +25,8 @@ from ncs_gym.validation import (
     warn_caller,
 )
 
+# There is an error set for every age.
+MAX_AGE = 1000
 # Packets in flight are kept in memory, for every environment [steps].
 LONGEST_DELAY = 1000
 # Share of steps in which the newest sample may be older than it usually is.
@@ -407,10 +409,6 @@ def as_packet(value: Any, size: int) -> Packet:
             f"measurement of shape ({size},), got {shown(value)}"
         )
     return Packet(stamp, np.array(numbers), episode)
-
-
-# There is an error set for every age.
-MAX_AGE = 1000
 
 
 class BrokenContractWarning(UserWarning):
