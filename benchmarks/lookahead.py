@@ -51,10 +51,10 @@ def admitted(safe_set: SafeSet = "polytope", situations: int = 2000) -> None:
         states = np.empty((0, plant.n))
         while len(states) < situations:
             more = rng.uniform(-1, 1, (situations, plant.n)) * plant.half_widths
-            states = np.concatenate([states, more[(np.abs(more @ plant.box_rows.T) <= 1.0).all(axis=1)]])
+            states = np.concatenate([states, more[(np.abs(more @ plant.box.T) <= 1.0).all(axis=1)]])
         states = states[:situations]
         estimates = states + Ellipsoid(shape).sample_boundary(rng, situations)
-        proposed = rng.uniform(-1, 1, (situations, plant.m)) * plant.u_max
+        proposed = rng.uniform(-1, 1, (situations, plant.m)) * plant.largest_input
         shares = [np.mean(certificate.safe_set.gauge(states) <= 1.0)]
         for shield in (SafetyFilter(certificate, plant), SafetyFilter(certificate, plant, "lookahead", horizon)):
             decided = (shield.decide(x_hat, shape, u) for x_hat, u in zip(estimates, proposed, strict=True))
@@ -74,14 +74,14 @@ def _median_shape(env: Any) -> np.ndarray:
 
 def _kept_by_some_input(plant: LinearPlant, estimates: np.ndarray, shape: np.ndarray) -> float:
     """Returns for what share of estimates some input is sure to keep the next state in the box."""
-    C, D = plant.box_rows, plant.disturbance.shape_matrix
+    C, D = plant.box, plant.disturbance.shape_matrix
     reach = sum(
         np.sqrt(np.maximum(np.einsum("ji,ik,jk->j", *each), 0.0))
         for each in ((C, D, C), (C @ plant.A, shape, C @ plant.A))
     )
     rows, drifts = C @ plant.B, estimates @ (C @ plant.A).T
     A_ub, b_ub = np.vstack([rows, -rows]), np.hstack([1.0 - reach - drifts, 1.0 - reach + drifts])
-    bounds = np.stack([-plant.u_max, plant.u_max], axis=1)
+    bounds = np.stack([-plant.largest_input, plant.largest_input], axis=1)
     return float(np.mean([linprog(np.zeros(plant.m), A_ub, each, bounds=bounds).success for each in b_ub]))
 
 
@@ -101,10 +101,10 @@ class PlainProgram:
         )
         self.u, self.c = cp.Variable((steps, plant.m)), cp.Variable((steps + 1, plant.n))
         self.weighted = cp.Variable(plant.n)
-        constraints = [self.c[0] == self.start, cp.abs(self.u) <= np.tile(plant.u_max, (steps, 1))]
+        constraints = [self.c[0] == self.start, cp.abs(self.u) <= np.tile(plant.largest_input, (steps, 1))]
         constraints += [self.c[1:] == self.c[:-1] @ plant.A.T + self.u @ plant.B.T]
-        rows, count = self.plans.prediction.rows, len(plant.box_rows)
-        constraints += [cp.abs(self.c[1:-1] @ plant.box_rows.T) <= self.row_limits[:-1, :count]] if steps > 1 else []
+        rows, count = self.plans.prediction.rows, len(plant.box)
+        constraints += [cp.abs(self.c[1:-1] @ plant.box.T) <= self.row_limits[:-1, :count]] if steps > 1 else []
         if self.plans.prediction.ends:
             constraints += [self.weighted == self.weighting @ self.c[-1], cp.norm(self.weighted) <= self.radius]
         else:

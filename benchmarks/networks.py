@@ -602,13 +602,12 @@ def count_gains(env: NCSEnv, histories: ArrivalHistories) -> Counter[str]:
     """Returns counts of which gain an estimator takes, of every update that it looks up in a graph from now on."""
     counts: Counter[str] = Counter()
     kinds: dict[int, str] = {}
-    sensor = env.plant.kalman_covariances[1] + env.channel.quantization_step**2 / 12.0 * np.eye(env.plant.p)
     table, update = histories.table, histories.table.update
 
     def counted(number: int) -> tuple[np.ndarray, np.ndarray]:
         found = update(number)
         if number not in kinds:
-            kinds[number] = kind_of(found[0], table.statistics(number), histories.recursion, sensor)
+            kinds[number] = kind_of(found[0], table.statistics(number), histories.recursion, histories.recursion.R)
         counts[kinds[number]] += 1
         return found
 

@@ -26,12 +26,12 @@ from ncs_gym import Ball, Bounds, Box, Limits, LinearPlant, Model, Through
 
 RANDOM, SAME_SET = 100, 1e-12
 EXACT = (
-    *("A", "B", "H", "dt", "box", "box_ends", "input_ends", "mixed_rows", "mixed_ends", "gamma", "process_noise_cov"),
-    *("measurement_noise_cov", "initial_cov", "operating_state", "operating_input", "step_offset", "own_limits"),
-    *("input_middle", "input_half", "reach", "between_samples", "continuous_model"),
+    *("A", "B", "H", "dt", "box", "box_ends", "input_ends", "mixed_rows", "mixed_ends", "gamma"),
+    *("operating_state", "operating_input", "step_offset", "own_limits"),
+    *("input_middle", "input_half", "reach", "between_samples"),
 )
 SETS = (
-    *("disturbance", "allowed_disturbance", "nominal_disturbance", "sensor_error", "nominal_sensor_error"),
+    *("disturbance", "allowed_disturbance", "nominal_disturbance", "nominal_sensor_error"),
     *("initial_error", "nominal_initial_error"),
 )
 File = tyro.conf.Positional[Path]

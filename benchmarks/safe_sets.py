@@ -45,13 +45,13 @@ class Viability:
 
     def __init__(self, plant: LinearPlant, steps: int = 100) -> None:
         n, m = plant.n, plant.m
-        scale, limits = plant.half_widths, plant.u_max
+        scale, limits = plant.half_widths, plant.largest_input
         A, B = plant.A * scale / scale[:, None], plant.B * limits / scale[:, None]
         # Variables: the size t of the start, states x_0 .. x_N and inputs u_0 .. u_{N-1}, in units of their limits.
-        columns, faces = 1 + (steps + 1) * n + steps * m, (steps + 1) * len(plant.box_rows)
+        columns, faces = 1 + (steps + 1) * n + steps * m, (steps + 1) * len(plant.box)
         moved = sparse.kron(sparse.eye(steps, steps + 1), A) - sparse.kron(sparse.eye(steps, steps + 1, 1), np.eye(n))
         moves = [sparse.csr_matrix((steps * n, 1)), moved, sparse.kron(sparse.eye(steps), B)]
-        rows = sparse.kron(sparse.eye(steps + 1), plant.box_rows * scale)
+        rows = sparse.kron(sparse.eye(steps + 1), plant.box * scale)
         rows = sparse.hstack([sparse.csr_matrix((faces, 1)), rows, sparse.csr_matrix((faces, steps * m))])
         self._moves, self._scale, self._start = sparse.hstack(moves), scale, sparse.lil_matrix((n, columns))
         bounds = [(0.0, None)] + [(None, None)] * ((steps + 1) * n) + [(-1.0, 1.0)] * (steps * m)

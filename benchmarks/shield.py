@@ -85,7 +85,7 @@ class ConicFilter:
         self.proposed, self.offset = cp.Parameter(m), cp.Parameter(n)
         self.effect, self.radius = cp.Parameter((n, m)), cp.Parameter()
         reached = cp.norm(self.offset + self.effect @ self.u)
-        constraints = [reached <= self.radius - MARGIN, cp.abs(self.u) <= shield.plant.u_max]
+        constraints = [reached <= self.radius - MARGIN, cp.abs(self.u) <= shield.plant.largest_input]
         self.problem = cp.Problem(cp.Minimize(cp.sum_squares(self.u - self.proposed)), constraints)
 
     def decide(self, estimate: np.ndarray, error_shape: np.ndarray, proposed: np.ndarray) -> np.ndarray:
@@ -99,7 +99,7 @@ class ConicFilter:
         self.problem.solve(solver=cp.CLARABEL)
         if self.u.value is not None and self.problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
             return self.u.value
-        return np.clip(self.shield.certificate.K @ estimate, -plant.u_max, plant.u_max)
+        return np.clip(self.shield.certificate.K @ estimate, -plant.largest_input, plant.largest_input)
 
 
 def recorded(env: NCSEnv, shield: SafetyFilter, steps: int) -> list[tuple[np.ndarray, ...]]:
@@ -109,7 +109,9 @@ def recorded(env: NCSEnv, shield: SafetyFilter, steps: int) -> list[tuple[np.nda
         _, info = shielded.reset(seed=len(cases))
         for _ in range(min(200, steps)):
             action = rng.uniform(-1, 1, shield.plant.m).astype(np.float32)
-            cases.append((info["estimate"], info["error_shape"], shield.plant.u_max * action.astype(np.float64)))
+            cases.append(
+                (info["estimate"], info["error_shape"], shield.plant.largest_input * action.astype(np.float64))
+            )
             *_, info = shielded.step(action)
     return cases[:steps]
 
@@ -141,7 +143,7 @@ def decision(steps: int = 400) -> None:
         gaps = [0.0]
         for case in by_reason["projected"]:
             far, least = (np.linalg.norm(u - case[2]) for u in (shield.decide(*case).input, conic.decide(*case)))
-            gaps.append(float((far - least) / max(least, 1e-3 * float(env.plant.u_max.max()))))
+            gaps.append(float((far - least) / max(least, 1e-3 * float(env.plant.largest_input.max()))))
         columns = [f"{parts[reason]:.1f}" if reason in parts else "-" for reason in reasons]
         share = 1 - len(by_reason["safe"]) / len(cases)
         show(
@@ -213,7 +215,7 @@ def memory(steps: int = 100_000) -> None:
     loop.start(x)
     first = resident()
     for step in range(steps):
-        u = loop.step(rng.uniform(-1.0, 1.0, 1) * plant.u_max, packets).input
+        u = loop.step(rng.uniform(-1.0, 1.0, 1) * plant.largest_input, packets).input
         if step in (steps // 10, steps - 1):
             print(f"{step + 1:12,} steps: {resident() - first:.1f} MB", flush=True)
         x = plant.A @ x + plant.B @ u + plant.process_noise.sample(rng)
@@ -261,7 +263,7 @@ def containment(episodes: int = 15) -> None:
                 _, info = env.reset(seed=episode)
                 for step in range(EPISODE_STEPS):
                     action = act(step, episode).astype(np.float32)
-                    case = info["estimate"], info["error_shape"], plant.u_max * action.astype(np.float64)
+                    case = info["estimate"], info["error_shape"], plant.largest_input * action.astype(np.float64)
                     sets = env.filter.test.reachable(case[0][:, None], env.filter.errors_of(case[1]).batch())
                     test_margin, margin = (each.item() for each in sets.margins(case[2][:, None]))
                     contained, taken = timed(exact, env.filter, *case)
@@ -307,7 +309,7 @@ def mismatch(
 def _largest_step_outside(plant: LinearPlant, process: Any, rng: np.random.Generator) -> float:
     """Largest gauge of x+ - A x - B u in E(D) over samples of box x limits, corners among them."""
     moving = process.opened(plant, None)
-    widths = np.concatenate([plant.half_widths, plant.u_max])
+    widths = np.concatenate([plant.half_widths, plant.largest_input])
     largest = 0.0
     for number in range(4_000):
         point = widths * rng.uniform(-1.0, 1.0, len(widths))

@@ -40,7 +40,7 @@ decided, as_decided, overridden, proved, worst = [np.zeros(plant.m)] * loop.inpu
 for step in range(3000):
     loop.receive(up.send(Packet(step, plant.H @ state + plant.sensor_noise.sample(rng), loop.episode)))
     proved += loop.guaranteed
-    push = plant.u_max * (1.0 if step % 200 < 100 else -1.0)  # Full force one way, then the other.
+    push = plant.largest_input * (1.0 if step % 200 < 100 else -1.0)  # Full force one way, then the other.
     decision = loop.decide(push)
     decided.append(decision.input)
     overridden += decision.intervened
@@ -48,7 +48,7 @@ for step in range(3000):
     applied = actuator.apply(step)
     as_decided += np.array_equal(applied, decided[step])  # Three steps ago; nobody acknowledged it.
     state = plant.A @ state + plant.B @ applied + plant.nominal_disturbance.sample_boundary(rng)
-    worst = max(worst, float(np.abs(plant.box_rows @ state).max()))
+    worst = max(worst, float(np.abs(plant.box @ state).max()))
 print(f"decided {loop.input_delay} steps ahead; applied as decided: {as_decided} of 3000")
 print(f"overridden: {overridden} of 3000, closest to the limit: {worst:.3f} (violated above 1)")
 print(f"proved: {proved} of 3000 steps")

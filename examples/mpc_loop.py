@@ -18,8 +18,8 @@ x = cp.Variable((plant.n, HORIZON + 1))
 u = cp.Variable((plant.m, HORIZON))
 slack = cp.Variable(HORIZON, nonneg=True)
 start, target = cp.Parameter(plant.n), cp.Parameter()
-constraints = [x[:, 0] == start, x[:, 1:] == plant.A @ x[:, :-1] + plant.B @ u, cp.abs(u) <= plant.u_max[0]]
-constraints += [cp.abs(plant.box_rows[i] @ x[:, 1:]) <= 1.0 + slack for i in range(len(plant.box_rows))]
+constraints = [x[:, 0] == start, x[:, 1:] == plant.A @ x[:, :-1] + plant.B @ u, cp.abs(u) <= plant.largest_input[0]]
+constraints += [cp.abs(plant.box[i] @ x[:, 1:]) <= 1.0 + slack for i in range(len(plant.box))]
 cost = cp.sum_squares(x[0, 1:] - target) + 1e-3 * cp.sum_squares(u) + 100.0 * cp.sum(slack)
 problem = cp.Problem(cp.Minimize(cost), constraints)
 

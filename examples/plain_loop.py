@@ -25,6 +25,6 @@ for step in range(1000):
     packet = Packet(stamp=loop.steps, measurement=channel.quantize(y), episode=loop.episode)
     in_flight = [] if rng.random() < channel.loss else [packet]
     x = plant.A @ x + plant.B @ decision.input + plant.process_noise.sample(rng)
-    worst = max(worst, float(np.abs(plant.box_rows @ x).max()))
+    worst = max(worst, float(np.abs(plant.box @ x).max()))
 print(f"overridden: {overridden} of 1000; closest to the limit: {worst:.3f} (violated above 1)")
 print(f"proved to be safe: {loop.guaranteed}")

@@ -59,7 +59,7 @@ async def run_plant(wait_for, commands, send):
         send(step, y.tolist(), echo.steps, echo.missing, echo.digest.hex())
         actuator.receive(commands.due(step))
         x = plant.A @ x + plant.B @ actuator.apply(step) + plant.nominal_disturbance.sample_boundary(rng)
-        worst = max(worst, float(np.abs(plant.box_rows @ x).max()))
+        worst = max(worst, float(np.abs(plant.box @ x).max()))
     print(f"closest to the limit: {worst:.3f} (violated above 1); no command in time: {actuator.echo.missing} steps")
 
 

@@ -23,7 +23,7 @@ in_flight, lost, overridden, proved, oldest, worst = [], 0, 0, 0, 0, 0.0
 for step in range(5000):
     loop.receive(in_flight)
     proved, oldest = proved + loop.guaranteed, max(oldest, loop.measurement_age)
-    push = plant.u_max * (1.0 if step % 200 < 100 else -1.0)  # Full force one way, then the other.
+    push = plant.largest_input * (1.0 if step % 200 < 100 else -1.0)  # Full force one way, then the other.
     decision = loop.decide(push)
     overridden += decision.intervened
     is_lost = lost < channel.max_consecutive_losses and rng.random() < channel.loss
@@ -33,7 +33,7 @@ for step in range(5000):
         in_flight = [Packet(loop.steps, y, loop.episode)]
     disturbance = plant.nominal_disturbance.sample_boundary(rng)
     state = plant.A @ state + plant.B @ decision.input + disturbance
-    worst = max(worst, float(np.abs(plant.box_rows @ state).max()))
+    worst = max(worst, float(np.abs(plant.box @ state).max()))
 print(f"oldest sample in use: {oldest} steps, allowed: {loop.contract.max_age}")
 print(f"overridden: {overridden} of 5000, closest to the limit: {worst:.5f} (violated above 1)")
 print(f"proved: {proved} of 5000 steps")

@@ -123,6 +123,8 @@ class Through(UncertainSet):
         own = as_set(self.set).sized(E.shape[1])
         if any(isinstance(each, Gaussian) or each.is_left_out for each in Sum((own,)).parts):
             raise ValueError("Through takes no Gaussian, of which E P E' is a covariance, and no remainder")
+        if np.any(own.middle) and not isinstance(own, Box):
+            raise ValueError("Through takes a set with two different ends if that is a Box: give its ends, and one E")
         self._set(E=E, set=own, size=len(E), middle=E @ np.broadcast_to(own.middle, E.shape[1]))
         self.ellipsoid()
 
@@ -174,20 +176,11 @@ class Sum(UncertainSet):
 
 
 def pushes_of(own: Any) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns all E, shape (n, q), and w, shape (q,), whose E w add up to the middle of a set; none is zero.
-
-    What the rounding of a product E lost is another one.
-    """
+    """Returns all E, shape (n, q), and w, shape (q,), whose E w add up to the middle of a set; none is zero."""
     if isinstance(own, Sum):
         return [each for part in own.parts for each in pushes_of(part)]
-    if not isinstance(own, Through):
-        return [(np.eye(own.size), own.middle)] if np.any(own.middle) else []
-    pushes: list[tuple[np.ndarray, np.ndarray]] = []
-    for E, w in pushes_of(own.set):
-        product = exact.product(own.E, E)
-        lost = exact.product(np.hstack([own.E, -product]), np.vstack([E, np.eye(len(w))]))
-        pushes += [(each, w) for each in (product, lost) if each.any()]
-    return pushes
+    E, w = (own.E, own.set.middle) if isinstance(own, Through) else (np.eye(own.size), own.middle)
+    return [(E, w)] if np.any(w) else []
 
 
 def as_set(value: Any) -> Any:

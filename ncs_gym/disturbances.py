@@ -319,7 +319,7 @@ def as_noise(value: Any, plant: LinearPlant) -> str:
     """
     if not (isinstance(value, str) and value in NOISES):
         raise ValueError(f"noise must be one of {list(NOISES)}, got {shown(value)}")
-    covariances = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
+    covariances = plant.process_noise.covariance, plant.sensor_noise.covariance, plant.initial_noise.covariance
     if value == "gaussian" and not any(np.any(each) for each in covariances):
         raise ValueError('noise="gaussian" needs a Gaussian among the bounds of the plant')
     return value

@@ -34,8 +34,9 @@ MOST_POINTS = 64
 # Rows of the box keep inputs under way within this many times their limits, which they never leave: the rows only bound
 # the safe set. Closer ones would forbid inputs near their limit, farther ones enlarge the set by little.
 STORED_INPUT_REACH = 4.0
-# A resting point that is found is rounded to this, in units of the limits.
-POINT_PRECISION = 1e-11
+# Decimals of a resting point in units of the limits: what LAPACK finds differs between processors beyond them, and a
+# point is part of what identifies a plant.
+POINT_DECIMALS = 11
 
 
 class ChosenLimitsWarning(UserWarning):
@@ -151,11 +152,11 @@ class LimitValues(ReadOnlyArrays):
         directions = null_space(balance)
         sizes = np.vstack([np.hstack([rows * widths, np.zeros((len(rows), m))]), np.eye(m, n + m, n)])
         found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
-        x, u = widths * found[:n], reach * found[n:]
-        if not residual(A, B, E, x, u, middle)[1]:
+        if not residual(A, B, E, widths * found[:n], reach * found[n:], middle)[1]:
             pushed = shown((E @ middle).tolist())
             raise ValueError(f"no state stays where it is under the middle of a disturbance, {pushed} per step")
-        x, u = _in_steps(x, np.abs(rows).max(axis=0)), _in_steps(u, 1.0 / reach)
+        found = np.round(found, POINT_DECIMALS)
+        x, u = widths * found[:n], reach * found[n:]
         return x, u, residual(A, B, E, x, u, middle)[0]
 
     def with_past_inputs(self, delays: np.ndarray, change: np.ndarray | None) -> LimitValues:
@@ -308,16 +309,6 @@ def acting(delays: np.ndarray, past: int) -> np.ndarray:
     if np.ptp(delays, axis=0).any():
         raise ValueError("another process, or a limit of states and inputs together, needs one delay per input")
     return past - delays.shape[1] * delays[0] + np.arange(delays.shape[1])
-
-
-def _in_steps(values: np.ndarray, per_limit: np.ndarray) -> np.ndarray:
-    """Returns values rounded to `POINT_PRECISION` of limits, of which `per_limit` is the inverse, by powers of two.
-
-    What LAPACK finds differs between processors in the last bits, and a point is part of what identifies a plant.
-    """
-    sizes = np.where(per_limit > 0.0, 1.0 / np.where(per_limit > 0.0, per_limit, 1.0), np.maximum(np.abs(values), 1e-9))
-    steps = np.exp2(np.round(np.log2(POINT_PRECISION * sizes)))
-    return np.rint(values / steps) * steps
 
 
 def _beyond(values: np.ndarray, ends: np.ndarray) -> np.ndarray:

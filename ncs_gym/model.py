@@ -96,10 +96,9 @@ class Model(ReadOnlyArrays):
             self._set(**{name: point})
         dt, delays = as_number(self.dt, "dt", low=0.0, low_open=True), _steps(self.delays, B.shape, "delays")
         self._set(at=as_given(self.at), A=A, B=B, H=H, dt=dt, delays=delays)
-        if self.offset is not None:
-            self._set(offset=as_vector(self.offset, n, "offset"))
         lacking = np.zeros(n)
         if self.offset is not None:
+            self._set(offset=as_vector(self.offset, n, "offset"))
             lacking, rests = residual(A, B, np.eye(n), self.state, self.input, self.offset)
             if not rests:
                 text = f"A x0 + B u0 + c - x0 = {shown(lacking.tolist())}; a model of deviations has no offset"

@@ -91,12 +91,12 @@ def tasks(draw, plant: LinearPlant) -> Any:
     kind = draw(st.sampled_from(["regulation", "costs", "speed", "setpoint"]), label="task")
     if kind == "speed":
         return SpeedTracking(fastest=draw(st.sampled_from([1e-3, 25.0, 1e6])), input_index=plant.m - 1)
-    if kind == "setpoint" and (farthest := farthest_equilibrium(plant, plant.box_rows[0])) > 1e-6:
+    if kind == "setpoint" and (farthest := farthest_equilibrium(plant, plant.box[0])) > 1e-6:
         reach = min(draw(st.sampled_from([1e-6, 0.5, 1e6])), farthest)
         preview, price = draw(st.sampled_from([0, 3])), draw(st.sampled_from([0.0, 0.5]))
-        return SetpointTracking(output=plant.box_rows[0], reach=reach, width=0.1, preview=preview, change_price=price)
+        return SetpointTracking(output=plant.box[0], reach=reach, width=0.1, preview=preview, change_price=price)
     if kind == "costs":
-        return Regulation(state_cost=plant.box_rows.T @ plant.box_rows, input_cost=np.zeros((plant.m, plant.m)))
+        return Regulation(state_cost=plant.box.T @ plant.box, input_cost=np.zeros((plant.m, plant.m)))
     return Regulation()
 
 

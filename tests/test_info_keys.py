@@ -73,7 +73,7 @@ def assert_is(key, value, kind, plant):
     if kind in TYPES:
         assert isinstance(value, TYPES[kind])
     else:
-        sizes = {"n": plant.n, "m": plant.m, "k": len(plant.box_rows)}
+        sizes = {"n": plant.n, "m": plant.m, "k": len(plant.box)}
         assert value.shape == tuple(sizes[size] for size in re.findall("[nmk]", kind))
         assert value.dtype == (np.float32 if key.startswith("action_") else np.float64)
 

@@ -103,5 +103,5 @@ def between(plant: LinearPlant, points: int) -> list[np.ndarray]:
     """Rows of the box on state and input at times within a step, by the matrix exponential."""
     if not points:
         return []
-    G = np.concatenate([plant.continuous_model, np.zeros((plant.m, plant.n + plant.m))])
+    G = np.concatenate([plant.model.continuous, np.zeros((plant.m, plant.n + plant.m))])
     return [plant.box @ expm(G * (plant.dt * i / points))[: plant.n] for i in range(1, points)]

@@ -140,7 +140,7 @@ def designs() -> list[StateFeedback]:
     ours = synthesize(plant, safe_set="ellipsoid")
     assert isinstance(ours.safe_set, Ellipsoid)
     scale = _OP_SCALE * largest_scale(FeasibilityScan(plant), plant)
-    Q, P0 = scale * plant.process_noise_cov, scale * plant.initial_cov
+    Q, P0 = scale * plant.process_noise.covariance, scale * plant.initial_noise.covariance
     scaled = with_noise(plant, gamma=scale * plant.gamma, Q=Q, P0=P0)
     op = published.synthesize(scaled, dkappa=_OP_GRID_STEP, drho=_OP_GRID_STEP)
     box = BoxDisturbance((1.0 - 1e-9) * scale**0.5 * np.asarray(CASE_STUDY_BOX.half_widths))
@@ -166,7 +166,7 @@ def simulated(design: StateFeedback, settings: PaperSettings) -> tuple[np.ndarra
     for _ in range(settings.steps):
         inputs.append(info["estimate"] @ design.K.T)  # before the limit [m/s^2]
         errors.append(info["estimation_error"])
-        *_, info = envs.step(inputs[-1] / design.plant.u_max)
+        *_, info = envs.step(inputs[-1] / design.plant.largest_input)
         states.append(info["state"])
     return np.array(states), np.array(inputs), np.array(errors)
 
@@ -176,13 +176,13 @@ def outcome(
 ) -> dict[str, float | None]:
     """Returns counts of steps and largest values of what `simulated` returned, by name."""
     levels = np.einsum("ksi,ij,ksj->ks", states, np.linalg.inv(design.L), states)
-    boxes = np.abs(states @ design.plant.box_rows.T).max(axis=2)
+    boxes = np.abs(states @ design.plant.box.T).max(axis=2)
     gain = design.plant.B @ design.K
     return {
         "steps": inputs.size,
         "outside_set": int((levels[1:] > 1.0).sum()),
         "outside_box": int((boxes[1:] > 1.0).sum()),
-        "input_asked_beyond": int((np.abs(inputs) > design.plant.u_max).sum()),
+        "input_asked_beyond": int((np.abs(inputs) > design.plant.largest_input).sum()),
         "largest_level": float(levels.max()),
         "largest_error": float(np.square(errors @ gain.T).sum(axis=2).max()),
         "largest_estimation_error": float(np.square(errors).sum(axis=2).max()),

@@ -156,8 +156,8 @@ def _misread_alpha(example: PaperExample) -> float:
 
 def _safe_box(example: PaperExample) -> Claim:
     plant, L = example.plant, example.L
-    largest = max(float(row @ L @ row) for row in plant.box_rows)
-    rounded = max(float(row @ np.linalg.inv(example.M - _PRINTED_DIGITS * np.eye(2)) @ row) for row in plant.box_rows)
+    largest = max(float(row @ L @ row) for row in plant.box)
+    rounded = max(float(row @ np.linalg.inv(example.M - _PRINTED_DIGITS * np.eye(2)) @ row) for row in plant.box)
     is_rounding = 1.0 < largest <= rounded
     return Claim(
         "(C3) the set lies in the safe box",
@@ -169,13 +169,13 @@ def _safe_box(example: PaperExample) -> Claim:
 
 
 def _half_input_limit(example: PaperExample) -> Claim:
-    effort, half = _effort(example.K, example.L), float(example.plant.u_max[0]) ** 2 / 2
+    effort, half = _effort(example.K, example.L), float(example.plant.largest_input[0]) ** 2 / 2
     claim = "(C5) half of the squared input limit covers K x", f"u_max^2 / 2 = {half:g}", f"K L K' = {effort:.2f}"
     return _limited(*claim, effort <= half)
 
 
 def _input_limit(example: PaperExample) -> Claim:
-    largest, limit = _effort(example.K, example.L) ** 0.5, float(example.plant.u_max[0])
+    largest, limit = _effort(example.K, example.L) ** 0.5, float(example.plant.largest_input[0])
     computed = f"the largest |K x| on the set is {largest:.2f}, without any estimation error"
     return _limited("the input stays within its limit on the set", f"|u| <= {limit:g}", computed, largest <= limit)
 
@@ -285,7 +285,7 @@ def _feasibility(example: PaperExample) -> Claim:
 
 def design(example: PaperExample) -> Claim:
     """Returns the row about K and M as the optimum of OP at the printed kappa."""
-    asked, limit = (2.0 * _effort(example.K, example.L)) ** 0.5, float(example.plant.u_max[0])
+    asked, limit = (2.0 * _effort(example.K, example.L)) ** 0.5, float(example.plant.largest_input[0])
     printed, complete = optimum(example, limit), optimum(example, float(round(asked)), with_misread_margin=True)
     reproduced = np.abs(complete[1] - example.K).max() <= _PRINTED_DIGITS
     return Claim(
@@ -419,7 +419,7 @@ def late_packets(example: PaperExample) -> Claim:
 
 def sensor(example: PaperExample) -> Claim:
     """Returns the row about H and R, which the paper does not print."""
-    assumed = float(example.plant.measurement_noise_cov[0, 0])
+    assumed = float(example.plant.sensor_noise.covariance[0, 0])
     errors = [largest_error(example, taken_as_current, noise_variance=variance) for variance in _NOISE_VARIANCES]
     return Claim(
         "the sensor of the simulation (H and R of Definition 1)",
@@ -464,7 +464,7 @@ def box_is_invariant(example: PaperExample) -> bool:
 
 def _half_widths(example: PaperExample) -> np.ndarray:
     """Returns the half-widths w_i of the safe box, whose rows are c_i = e_i / w_i with powers of two, shape (2,)."""
-    return 1.0 / np.diag(example.plant.box_rows)
+    return 1.0 / np.diag(example.plant.box)
 
 
 CLAIMS: tuple[Callable[[PaperExample], Claim], ...] = (

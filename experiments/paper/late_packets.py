@@ -33,8 +33,8 @@ class Definition1Filter:
     def __init__(self, example: PaperExample, plant: LinearPlant, mean: np.ndarray, *, takes_late: bool) -> None:
         self.mean, self._plant, self._takes_late = mean, plant, takes_late
         self._G = plant.A + plant.B @ example.K
-        self._Q_bar = plant.process_noise_cov + plant.gamma * np.eye(plant.n)
-        self._covariance = np.repeat(plant.initial_cov[None], mean.shape[1], axis=0)
+        self._Q_bar = plant.process_noise.covariance + plant.gamma * np.eye(plant.n)
+        self._covariance = np.repeat(plant.initial_noise.covariance[None], mean.shape[1], axis=0)
         # By age: what was measured, None where nobody sent.
         self._samples: list[np.ndarray | None] = []
 
@@ -54,7 +54,7 @@ class Definition1Filter:
     def _correct(self, sample: np.ndarray, arrives: np.ndarray) -> None:
         """Corrects the episodes in which a sample, shape (p, N), arrives, as if it were measured now."""
         H, P = self._plant.H, self._covariance[arrives]
-        gains = P @ H.T @ np.linalg.inv(H @ P @ H.T + self._plant.measurement_noise_cov)
+        gains = P @ H.T @ np.linalg.inv(H @ P @ H.T + self._plant.sensor_noise.covariance)
         residuals = (sample - H @ self.mean)[:, arrives]
         self.mean[:, arrives] += np.einsum("eij,je->ie", gains, residuals)
         self._covariance[arrives] = (np.eye(self._plant.n) - gains @ H) @ P
@@ -88,7 +88,7 @@ def largest_error(
     process = PlantSimulation(plant, example.disturbance, False, STARTS)
     memory, network = process.begin(rng, STARTS), VectorChannelState(channel, rng, STARTS)
     estimator = make_filter(example, plant, state + plant.of_first_error.drawn(rng, STARTS).T)
-    gain, limit, largest = plant.B @ example.K, plant.u_max[:, None], 0.0
+    gain, limit, largest = plant.B @ example.K, plant.largest_input[:, None], 0.0
     for step in range(STEPS):
         largest = max(largest, float(np.square(gain @ (estimator.mean - state)).sum(axis=0).max()))
         u = np.clip(example.K @ estimator.mean, -limit, limit)

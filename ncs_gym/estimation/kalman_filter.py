@@ -10,6 +10,7 @@ import numpy as np
 from ncs_gym.ellipsoid import FLAT_INFLATION, INFLATION, is_inside, outer_sum
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.plants.linear_plant import LinearPlant
+from ncs_gym.validation import read_only
 
 # Per dimension, the growth of computed shapes that covers the rounding of F S F' (see `enlarged_by_rounding`).
 ROUNDING = 1e-13
@@ -238,10 +239,14 @@ class ErrorRecursion:
     ) -> None:
         self.plant, self.error_set, self._bits = plant, error_set, covariance_bits
         self.sets = SetMembership(plant, quantization_step, error_set, shape_step)
-        self.Q, self.R = plant.kalman_covariances[0], _sensor_covariance(plant, quantization_step)
+        # Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; other
+        # bounds count with the covariance of a uniform draw, P / (dim + 2).
+        Q, remainder = plant.of_disturbance.covariance(1.0), plant.remainder_bound
+        self.Q = read_only(Q if remainder is None else Q + remainder.shape_matrix)
+        self.R = _sensor_covariance(plant, quantization_step)
         if first is None:
-            shape = plant.initial_error.shape_matrix
-            first = ErrorStatistics(plant.kalman_covariances[2], shape, 0, is_inside(shape, error_set.shapes[0]))
+            shape, covariance = plant.initial_error.shape_matrix, plant.of_first_error.covariance(plant.n + 2)
+            first = ErrorStatistics(read_only(covariance), shape, 0, is_inside(shape, error_set.shapes[0]))
         self.first = first
         # Deviations of states that nothing disturbs would become smaller for ever, and covariances would not recur:
         # they are no smaller than this share of the largest one, each in units of what the certified set allows.
@@ -332,7 +337,7 @@ def _rounded(covariance: np.ndarray, bits: int, smallest: np.ndarray) -> np.ndar
 
 def _sensor_covariance(plant: LinearPlant, quantization_step: float) -> np.ndarray:
     """Returns R, shape (p, p), with q^2/12 of a quantizer, invertible."""
-    R = plant.kalman_covariances[1] + quantization_step**2 / 12.0 * np.eye(plant.p)
+    R = plant.of_sensor.covariance(plant.p + 2) + quantization_step**2 / 12.0 * np.eye(plant.p)
     scale = np.sqrt(np.diag(R))
     # Of perfect sensors the innovation covariance stays invertible.
     if not scale.all() or np.linalg.eigvalsh(R / np.outer(scale, scale))[0] <= 0.0:

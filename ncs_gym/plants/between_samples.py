@@ -17,7 +17,7 @@ _MARGIN, _ROUNDING = 0.01, 1e-12
 
 
 def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
-    """Returns `kept_ends`, `arriving`, `step_rows` and `step_ends` of a plant whose box counts at N times of each step.
+    """Returns what follows for a plant whose box counts at N times of each step: `kept_ends` to `way_rows`.
 
     With the input held, x(tau) = A_tau x + B_tau u + d_tau, where [A_tau, B_tau] is the upper part of exp(G tau) for
     G = [[Ac, Bc], [0, 0]]. A row c of the box is one on (x, u) at the times tau_i = i dt / N, of which the first is on
@@ -26,9 +26,18 @@ def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
     derivative, here [c, 0] G^2 exp(G tau) (x, u). In the norm |q|_W = sum |q_j| W_j, with W the largest |x_j| and
     |u_j|, that grows from one time to the next by at most exp(h m), m the logarithmic norm of G.
 
+    What a disturbance did by tau counts in proportion to the time: (tau / dt) (x+ - A x - B u) is in E(D), too.
+
     Raises:
-        ValueError: If the bound is out of reach of float64, or leaves nothing of a limit.
+        ValueError: If nothing is known of times within a step, or the bound is out of reach of float64, or leaves
+            nothing of a limit.
     """
+    has_remainder = any(each.is_left_out for each in plant.bounds.disturbance.parts)
+    if plant.model.continuous is None or plant.past or has_remainder or plant.step_offset.any():
+        needed = "a model of Model.sampled, without delays, rates, remainder and constant disturbance"
+        raise ValueError(f"between_samples needs {needed}: else nothing is known of times within a step")
+    if exact.rank(plant.box[np.isfinite(plant.box_ends).all(axis=0)]) < plant.n:
+        raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")
     points, n, m = plant.limits.between_samples or 1, plant.n, plant.m
     G, h = np.concatenate([plant.model.continuous, np.zeros((m, n + m))]), plant.dt / points
     box, W = np.pad(plant.box, ((0, 0), (0, m))), np.concatenate([plant.widest(), plant.largest_input])
@@ -55,7 +64,10 @@ def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
             f"half its range, what is between the times {eta[j]:.3g}; more of them, a shorter dt or less disturbance "
             "would help"
         )
+    shares = (np.arange(1, points) / points)[:, None, None]
+    way = [rows[1:] - shares * (plant.box @ np.hstack([plant.A, plant.B])), np.tile(plant.box, (points - 1, 1, 1))]
     return {
+        "way_rows": read_only(np.concatenate([way[0], shares * way[1]], axis=2).reshape(-1, 2 * n + m)),
         "kept_ends": read_only(kept_ends),
         "arriving": read_only(rho),
         "step_rows": read_only(np.concatenate([plant.mixed_rows, *rows[1:]])),

@@ -13,7 +13,7 @@ import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, as_set
-from ncs_gym.ellipsoid import Ellipsoid, UncertainSet, outer_sum
+from ncs_gym.ellipsoid import Ellipsoid, TruncatedGaussian, UncertainSet, outer_sum
 from ncs_gym.limits import sides
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import (
@@ -328,9 +328,9 @@ SAME = 1e-9
 _SAME = {
     **{name: name for name in ("H", "dt", "between_samples", "delta")},
     "past": "delay, or a rate",
-    **dict.fromkeys(("gamma", "process_noise_cov"), "Bounds(disturbance=...)"),
-    **dict.fromkeys(("measurement_noise_cov", "sensor_bound"), "Bounds(sensor=...)"),
-    **dict.fromkeys(("initial_cov", "initial_bound"), "Bounds(first_error=...)"),
+    **dict.fromkeys(("gamma", "process_noise"), "Bounds(disturbance=...)"),
+    **dict.fromkeys(("sensor_noise", "sensor_bound"), "Bounds(sensor=...)"),
+    **dict.fromkeys(("initial_noise", "initial_bound"), "Bounds(first_error=...)"),
     **dict.fromkeys(("state_names", "state_units", "input_names", "input_units"), "labels"),
 }
 # Bounds of disturbances that hold this rounding agree to this, relative to the terms of a step.
@@ -552,6 +552,8 @@ class _Shared:
 
 
 def _is_same(one: Any, other: Any, tolerance: float) -> bool:
+    if isinstance(one, TruncatedGaussian):
+        one, other = one.covariance, other.covariance
     one, other = (each.shape_matrix if isinstance(each, Ellipsoid) else each for each in (one, other))
     if tolerance:
         return one.shape == other.shape and np.allclose(one, other, rtol=tolerance, atol=0.0)

@@ -144,6 +144,7 @@ class LinearPlant(LimitValues):
         arriving: rho of each row of the box, shape (k,): the part of that which is due to the disturbance of a step.
         step_rows, step_ends: Limits of (x, u) at the beginning of a step that proofs keep, shapes (g, n + m) and (2,
             g): the mixed ones, and rows of the box at the other times of the step, by time.
+        way_rows: Rows of the box at these times, given (x, u, x+) of a step, shape (g - q, 2 n + m).
         n, m, p: Number of states, inputs and outputs.
         of_disturbance, of_sensor, of_first_error: What is declared of each; other attributes name parts of these.
         remainder: What the model leaves out of the process that really moves; None if nothing.
@@ -173,9 +174,9 @@ class LinearPlant(LimitValues):
     arriving: np.ndarray = field(init=False)
     step_rows: np.ndarray = field(init=False)
     step_ends: np.ndarray = field(init=False)
+    way_rows: np.ndarray = field(init=False)
     delta: float = field(init=False)
     dt = setting("dt", "model.dt")
-    continuous_model = setting("continuous_model", "model.continuous")
     between_samples = setting("between_samples", "limits.between_samples")
     gamma = setting("gamma", "of_disturbance.ball")
     process_noise = setting("process_noise", "of_disturbance.noise")
@@ -184,9 +185,6 @@ class LinearPlant(LimitValues):
     disturbance_bound = setting("disturbance_bound", "of_disturbance.bound")
     sensor_bound = setting("sensor_bound", "of_sensor.bound")
     initial_bound = setting("initial_bound", "of_first_error.bound")
-    process_noise_cov = setting("process_noise_cov", "of_disturbance.noise.covariance")
-    measurement_noise_cov = setting("measurement_noise_cov", "of_sensor.noise.covariance")
-    initial_cov = setting("initial_cov", "of_first_error.noise.covariance")
 
     def __post_init__(self) -> None:
         for name, kind in _VALUES.items():
@@ -204,15 +202,8 @@ class LinearPlant(LimitValues):
         self._declare([declared, *sums[1:]], rest)
         self._name()
         self._set(kept_ends=self.box_ends, arriving=np.zeros(len(self.box)))
-        self._set(step_rows=self.mixed_rows, step_ends=self.mixed_ends)
+        self._set(step_rows=self.mixed_rows, step_ends=self.mixed_ends, way_rows=np.empty((0, 2 * self.n + self.m)))
         if self.between_samples is not None:
-            has_remainder = len(declared.parts) < len(sums[0].parts)
-            if self.continuous_model is None or self.past or has_remainder or self.step_offset.any():
-                needed = "a model of Model.sampled, without delays, rates, remainder and constant disturbance"
-                raise ValueError(f"between_samples needs {needed}: else nothing is known of times within a step")
-            if exact.rank(self.box[np.isfinite(self.box_ends).all(axis=0)]) < self.n:
-                ends = "two ends that bound every state: give generous ones"
-                raise ValueError(f"between_samples needs Limits with {ends}")
             self._set(**kept_at_all_times(self))
         if owned := [each.of_plant(self) for each in sums[0].parts if each.is_left_out]:
             disturbance = Sum((*declared.parts, *owned))
@@ -324,8 +315,8 @@ class LinearPlant(LimitValues):
         held = self.nominal_disturbance, self.nominal_sensor_error, self.nominal_initial_error
         without = [text for text, each in zip(_WITHOUT, held, strict=True) if not each.shape_matrix.any()]
         assumed = [f"It is assumed that {text}." for text in without]
-        covariances = self.process_noise_cov, self.measurement_noise_cov, self.initial_cov
-        if truncated := [name for name, each in zip(_NOISES, covariances, strict=True) if each.any()]:
+        noises = self.process_noise, self.sensor_noise, self.initial_noise
+        if truncated := [name for name, each in zip(_NOISES, noises, strict=True) if each.covariance.any()]:
             kept = f"{100.0 * (1.0 - self.delta):.6g} % (delta = {self.delta:g}) of {', '.join(truncated)}"
             assumed.append(f"Gaussian noise is truncated: the bounds hold {kept}, not the rest.")
         if self.remainder is not None:
@@ -357,23 +348,6 @@ class LinearPlant(LimitValues):
         low, high = np.concatenate([self.box_ends, self.input_ends], axis=1)
         units = high[: len(self.box)] == 1.0
         return bool(units.all()) and np.array_equal(-low, high) and not len(self.step_rows)
-
-    @property
-    def box_rows(self) -> np.ndarray:
-        """Rows c_j of a symmetric safe box |c_j x| <= 1, shape (k, n); raises ValueError if limits are others."""
-        return self._if_symmetric(self.box)
-
-    @property
-    def u_max(self) -> np.ndarray:
-        """Symmetric limits |u_i| <= u_max_i, shape (m,); raises ValueError if limits are others."""
-        return self._if_symmetric(self.input_ends[1])
-
-    def _if_symmetric(self, value: np.ndarray) -> np.ndarray:
-        if not self.is_symmetric:
-            raise ValueError(
-                "this needs limits |c_j x| <= 1 at samples and |u_i| <= u_max_i alone, and the plant has others"
-            )
-        return value
 
     @cached_property
     def state_limit(self) -> np.ndarray:
@@ -470,36 +444,14 @@ class LinearPlant(LimitValues):
         rounding = 4.0 * np.finfo(float).eps * SIMULATED_REACH * self.half_widths
         return read_only(2.0 * self.n / (INFLATION - 1.0) * np.diag(np.square(rounding)))
 
-    @cached_property
-    def kalman_covariances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Covariances (Q, R, P0) from which a Kalman filter picks its gains.
-
-        Q + gamma I (Liu et al. Definition 1), where a declared disturbance counts as the ball of gamma does; other
-        bounds count with the covariance of a uniform draw, P / (dim + 2).
-        """
-        Q, R = self.of_disturbance.covariance(1.0), self.of_sensor.covariance(self.p + 2)
-        Q = Q if self.remainder_bound is None else Q + self.remainder_bound.shape_matrix
-        return read_only(Q), read_only(R), read_only(self.of_first_error.covariance(self.n + 2))
-
-    @cached_property
-    def _rows_within_step(self) -> np.ndarray:
-        """Rows on (x, u, x+) that are c x(tau_i), i = 1..N-1, shape ((N - 1) k, 2 n + m).
-
-        What a disturbance did has come in proportion to the time: d_tau = (tau / dt) (x+ - A x - B u) is in E(D), too.
-        """
-        rows = self.step_rows[len(self.mixed_rows) :].reshape(-1, len(self.box), self.n + self.m)
-        shares = (np.arange(1, len(rows) + 1) / (len(rows) + 1))[:, None, None]
-        before = shares * (self.box @ np.hstack([self.A, self.B]))
-        return np.concatenate([rows - before, shares * self.box], axis=2).reshape(-1, 2 * self.n + self.m)
-
     def worst_constraint_values(self, state: np.ndarray, u: np.ndarray, x_next: np.ndarray) -> np.ndarray:
         """Returns the largest `constraint_values` of a step after its beginning, then its `mixed_values`.
 
         Shape (k + q,) or (k + q, N), for x, x+ of shape (n,) or (n, N) and the input that was held, (m,) or (m, N).
         """
-        values, rows = self.constraint_values(x_next), self._rows_within_step
-        if len(rows):
-            reached = rows.dot(np.concatenate([state, u, x_next])).reshape(-1, *values.shape)
+        values = self.constraint_values(x_next)
+        if len(self.way_rows):
+            reached = self.way_rows.dot(np.concatenate([state, u, x_next])).reshape(-1, *values.shape)
             low, high = self.box_ends if values.ndim == 1 else self.box_ends[:, :, None]
             values = np.maximum(np.maximum(reached.max(axis=0) - high, low - reached.min(axis=0)), values)
         return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values

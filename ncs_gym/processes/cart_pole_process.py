@@ -89,5 +89,8 @@ def sampled_cart_pole() -> LinearPlant:
     """Returns the same model, found anew."""
     tangent = cart_pole()
     noise = NOISE * tangent.half_widths
-    limits, bounds = Limits(state=np.round(tangent.half_widths, 9), input=tangent.u_max), Bounds(noise, noise, noise)
+    limits, bounds = (
+        Limits(state=np.round(tangent.half_widths, 9), input=tangent.largest_input),
+        Bounds(noise, noise, noise),
+    )
     return linear_model(CartPoleProcess(), limits, bounds, tangent.dt, labels=tangent.labels, samples=SAMPLES)

@@ -81,7 +81,7 @@ def with_noise(
         R: Covariance of sensor noise, shape (p, p).
         P0: Covariance of the first error, shape (n, n).
     """
-    own = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
+    own = plant.process_noise.covariance, plant.sensor_noise.covariance, plant.initial_noise.covariance
     given = zip((Q, R, P0), own, strict=True)
     process, sensor, first = (Gaussian(kept if new is None else new, plant.delta) for new, kept in given)
     ball = Ball(np.sqrt(plant.gamma if gamma is None else gamma))
@@ -89,7 +89,7 @@ def with_noise(
 
 
 def unknown_bounds(plant: LinearPlant) -> list[str]:
-    """Returns the declared bounds of a plant of which the paper's theorems know nothing, as a user gave them."""
+    """Returns what a plant has of which the paper's theorems know nothing, as a user gave it."""
     other = "another set in Bounds({}=...)".format
     declared = {
         other("disturbance"): plant.disturbance_bound,
@@ -97,7 +97,8 @@ def unknown_bounds(plant: LinearPlant) -> list[str]:
         other("sensor"): plant.sensor_bound,
         other("first_error"): plant.initial_bound,
     }
-    return [name for name, bound in declared.items() if bound is not None and np.any(bound.shape_matrix)]
+    others = [] if plant.is_symmetric else ["limits that are not |c_j x| <= 1 and |u_i| <= u_max_i alone"]
+    return others + [name for name, bound in declared.items() if bound is not None and np.any(bound.shape_matrix)]
 
 
 class PaperModel:
@@ -110,8 +111,8 @@ class PaperModel:
 
     def __init__(self, plant: LinearPlant, *, quantile: float | None = None) -> None:
         self._gamma, self._norm = plant.gamma, float(np.linalg.norm(plant.A, 2))
-        self._p0 = _largest(plant.initial_cov)
-        self._q_bar = _largest(plant.process_noise_cov) + plant.gamma
+        self._p0 = _largest(plant.initial_noise.covariance)
+        self._q_bar = _largest(plant.process_noise.covariance) + plant.gamma
         self._quantile = plant.process_noise.energy if quantile is None else quantile
 
     def epsilon_up(self, g2: float, rest: float | None = None) -> float:

@@ -124,9 +124,9 @@ def _conditions(certificate: PaperCertificate, plant: LinearPlant) -> Iterator[C
     yield matrix_condition("(C1) [kappa L, *; (A+BK) L, L] >= 0", _blocks(scale(kappa, L), closed_loop, L))
     alpha = Fraction(bounds.alpha)
     yield matrix_condition("(C2) L >= alpha I", subtract(L, scale(alpha * (1 + _ROUNDING), identity)))
-    for j, row in enumerate(plant.box_rows):
+    for j, row in enumerate(plant.box):
         yield scalar_condition(f"(C3) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
-    for i, limit in enumerate(plant.u_max):
+    for i, limit in enumerate(plant.largest_input):
         F = multiply([K[i]], L)
         used = quadratic([K[i]], L)
         if bounds.epsilon_up > 0.0:

@@ -91,7 +91,7 @@ def _scanned(problem: OptimizationProblem) -> tuple[tuple[float, float, float], 
 
 def largest_scale(scan: FeasibilityScan, plant: LinearPlant) -> float:
     """Returns the largest common factor on gamma, Q and P0, below 1, with which OP is feasible; 0.0 if none is."""
-    gamma, Q, P0 = plant.gamma, plant.process_noise_cov, plant.initial_cov
+    gamma, Q, P0 = plant.gamma, plant.process_noise.covariance, plant.initial_noise.covariance
 
     def scaled(by: float) -> LinearPlant:
         return with_noise(plant, gamma=by * gamma, Q=by * Q, P0=by * P0)

@@ -53,9 +53,9 @@ class OptimizationProblem:
     """
 
     def __init__(self, plant: LinearPlant) -> None:
-        self._n, self._u_max = plant.n, plant.u_max
-        self._size = float(np.linalg.det(largest_box_ellipsoid(plant.box_rows))) ** (0.5 / plant.n)
-        self._A, self._B, self._C = plant.A, plant.B * plant.u_max / self._size, plant.box_rows * self._size
+        self._n, self._u_max = plant.n, plant.largest_input
+        self._size = float(np.linalg.det(largest_box_ellipsoid(plant.box))) ** (0.5 / plant.n)
+        self._A, self._B, self._C = plant.A, plant.B * plant.largest_input / self._size, plant.box * self._size
         self._kappa, self._rho, self._alpha = (cp.Parameter(nonneg=True) for _ in range(3))
         # sqrt(eps_up) / alpha, 0 without communication error; and how much of the box and of u_max^2 may be used.
         self._error, self._share = cp.Parameter(nonneg=True), cp.Parameter(nonneg=True)

@@ -36,10 +36,10 @@ def synthesize(plant: LinearPlant, *, dkappa: float = 0.02, drho: float = 0.05) 
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
     if unknown := unknown_bounds(plant):
         raise ValueError(
-            f"the paper's method knows a Ball of disturbances and Gaussians alone, not {' and '.join(unknown)}: use "
-            "shields.synthesize"
+            "the paper's method knows symmetric limits, a Ball of disturbances and Gaussians alone, not "
+            f"{' and '.join(unknown)}: use shields.synthesize"
         )
-    free = plant.n - int(np.linalg.matrix_rank(plant.box_rows))
+    free = plant.n - int(np.linalg.matrix_rank(plant.box))
     if free:
         raise Infeasible(f"the safe box leaves {free} of {plant.n} directions unbounded: limit them", "S", free)
     for solution in grid_solutions(plant, dkappa, drho):

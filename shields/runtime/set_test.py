@@ -317,7 +317,7 @@ class ReachableSets(NamedTuple):
             return self._closest_on_rows(inputs, margin)
         effect = (self.weighting[:, :, None] * self.test.input_rows[:, :, None]).sum(axis=1)
         offset = (self.weighting * self.center).sum(axis=1)
-        return closest_admissible(inputs, offset, effect, self.radius - margin, self.test.plant.u_max)
+        return closest_admissible(inputs, offset, effect, self.radius - margin, self.test.plant.largest_input)
 
     def _closest_on_rows(self, inputs: np.ndarray, margin: float) -> np.ndarray:
         test, rows, closest = self.test, self.test.state_rows, np.empty(inputs.shape)

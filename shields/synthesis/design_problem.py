@@ -117,7 +117,7 @@ def design_problem(
     Raises:
         Infeasible: If the plant has no error set, or its safe box is flat.
     """
-    limits = SymmetricLimits(plant.box_rows, plant.u_max) if limits is None else limits
+    limits = SymmetricLimits(plant.box, plant.largest_input) if limits is None else limits
     _, sizes, directions = np.linalg.svd(limits.box_rows * plant.half_widths)
     flatness = float(sizes[0] / sizes[-1])
     if flatness > _FLATTEST:

@@ -80,7 +80,7 @@ def _multiplier_conditions(certificate: Certificate) -> Iterator[Condition]:
 def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[Condition]:
     """Checks that D, N and X0 contain what docs/shield_proof.md, "Setting", says they contain."""
     ball = scale(Fraction(plant.gamma), rational(np.eye(plant.n)))
-    noise = scale(Fraction(plant.process_noise.energy), rational(plant.process_noise_cov))
+    noise = scale(Fraction(plant.process_noise.energy), rational(plant.process_noise.covariance))
     weight = rational(plant.relative_weight)
     required = _with_declared(_sum_bound(ball, noise, weight), plant.disturbance_bound, weight)
     required = _with_declared(required, plant.remainder_bound, weight)
@@ -89,7 +89,7 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
     bound = _sum_bound(bound, _restlessness(certificate, plant), weight)
     yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(D), bound))
     identity = rational(np.eye(plant.p))
-    sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.measurement_noise_cov))
+    sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.sensor_noise.covariance))
     sensor = _with_declared(sensor, plant.sensor_bound, identity)
     if certificate.updates is None:
         yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape_matrix), sensor))
@@ -98,7 +98,7 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
         required = _sum_bound(scale(plant.p * step * step / 4, identity), sensor, identity)
         difference = subtract(rational(certificate.updates.noise), required)
         yield matrix_condition("N: holds the sensor noise and the quantization error", difference)
-    first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_cov))
+    first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_noise.covariance))
     first = _with_declared(first, plant.initial_bound, weight)
     yield matrix_condition(
         "X0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape_matrix), first)
@@ -154,9 +154,9 @@ def _ellipsoid_conditions(S: Ellipsoid, certificate: Certificate, plant: LinearP
     yield matrix_condition("L > 0", L, strict=True)
     BK, D, s = multiply(B, K), certificate.D, certificate.rounding
     assert s is not None  # of a certificate with an ellipsoid
-    D_u = _with_action_rounding(rational(D), B, plant.u_max, Fraction(s))
+    D_u = _with_action_rounding(rational(D), B, plant.largest_input, Fraction(s))
     closed_loop = congruence(add(rational(plant.A), BK), L)
-    for j, row in enumerate(plant.box_rows):
+    for j, row in enumerate(plant.box):
         yield scalar_condition(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - quadratic(rational(row), L))
     for age, proof in enumerate(certificate.proofs):
         label = "" if certificate.updates is None else f" at age {age}"
@@ -166,7 +166,7 @@ def _ellipsoid_conditions(S: Ellipsoid, certificate: Certificate, plant: LinearP
         successors = add(scale(1 / lx, closed_loop), scale(1 / le, congruence(BK, Sigma)), scale(1 / ld, D_u))
         name = f"(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0{label}"
         yield matrix_condition(name, subtract(L, successors))
-        for i, (limit, mu) in enumerate(zip(plant.u_max, map(Fraction, proof.inputs.tolist()), strict=True)):
+        for i, (limit, mu) in enumerate(zip(plant.largest_input, map(Fraction, proof.inputs.tolist()), strict=True)):
             used = quadratic([K[i]], L) / mu + quadratic([K[i]], Sigma) / (1 - mu)
             allowed = (Fraction(float(limit)) * (1 - ACTION_ROUNDING)) ** 2
             yield scalar_condition(f"(U) input {i + 1} stays within u_max (1 - 2^-24){label}", allowed - used)

@@ -54,8 +54,8 @@ def test_it_counts_what_a_plain_loop_counts(certificate, monkeypatch):
     for e, record in enumerate(played.episodes):
         assert (record.index, record.steps) == (e, 200)
         assert record.episode_return == pytest.approx(total[e])
-        assert record.violation_steps == (np.abs(states[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum() > 0
-        assert record.estimate_violation_steps == (np.abs(estimates[1:, e] @ plant.box_rows.T).max(axis=1) > 1.0).sum()
+        assert record.violation_steps == (np.abs(states[1:, e] @ plant.box.T).max(axis=1) > 1.0).sum() > 0
+        assert record.estimate_violation_steps == (np.abs(estimates[1:, e] @ plant.box.T).max(axis=1) > 1.0).sum()
         assert record.times_safe_set == pytest.approx(np.sqrt(max(x @ metric(certificate) @ x for x in states[:, e])))
         assert not record.guaranteed
 

@@ -51,7 +51,7 @@ def test_training_counts_every_violating_step(monkeypatch):
     class Counter(VectorWrapper):
         def step(self, actions):
             result = self.env.step(actions)
-            states = result[4]["state"] @ self.env.unwrapped.plant.box_rows.T
+            states = result[4]["state"] @ self.env.unwrapped.plant.box.T
             counted.extend((np.abs(states).max(axis=1) > 1.0).tolist())
             return result
 

@@ -106,7 +106,7 @@ def test_verdicts_are_true_in_any_order_of_summation(name):
     for _ in range(30):
         direction = rng.standard_normal(plant.n)
         direction /= certificate.safe_set.gauge(direction)
-        u, low, high = rng.uniform(-1.0, 1.0, plant.m) * plant.u_max, 0.0, 2.0
+        u, low, high = rng.uniform(-1.0, 1.0, plant.m) * plant.largest_input, 0.0, 2.0
         for _ in range(50):  # to the edge of what passes, where the last bits decide
             middle = 0.5 * (low + high)
             passes = filters[0].decide(middle * direction, shape, u).reason == "safe"
@@ -132,10 +132,10 @@ def reordered(certificate, plant, order):
         plant,
         A=plant.A[square],
         B=plant.B[order],
-        box=plant.box_rows[:, order],
+        box=plant.box[:, order],
         H=plant.H[:, order],
-        process_noise_cov=plant.process_noise_cov[square],
-        initial_cov=plant.initial_cov[square],
+        process_noise_cov=plant.process_noise.covariance[square],
+        initial_cov=plant.initial_noise.covariance[square],
         operating_state=plant.operating_state[order],
         continuous_model=None,
         **bounds,

@@ -97,6 +97,7 @@ def test_supports_of_a_sum_add_up_and_its_middles_too():
         (lambda: Through(E, Ball(0.1) + Gaussian(np.eye(2), 0.1)), "takes no Gaussian"),
         (lambda: Through(E, Ball(0.1) + Remainder(Ellipsoid(np.eye(2)), True, "given")), "and no remainder"),
         (lambda: Through(E, Sum(())), "a sum of no sets"),
+        (lambda: Through(E, Through(np.eye(2), Box([0, 0], [1, 1]))), "two different ends if that is a Box"),
         (lambda: Bounds(0.1, Box(0.0, 0.2), 0.1), r"Bounds\(sensor=...\) must have its middle at zero, got 0.1"),
         (lambda: Bounds(0.1, Through([[1.0]], Box(0.0, 0.2)) + Ball(0.1), 0.1), "must have its middle at zero"),
         (lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sums(3, 1), r"first_error=...\): a set in dimension 3 is needed"),

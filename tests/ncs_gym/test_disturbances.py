@@ -23,7 +23,7 @@ ROWS, M = np.array([[1.0, 2.0], [-3.0, 1.0], [0.0, 1.0]]), np.array([[0.5, 0.1],
 @pytest.mark.parametrize(
     ("source", "value"),
     [
-        (AdversarialDisturbance(), lambda plant, x: np.abs(x @ plant.box_rows.T).max(axis=1)),
+        (AdversarialDisturbance(), lambda plant, x: np.abs(x @ plant.box.T).max(axis=1)),
         (AdversarialDisturbance(rows=ROWS), lambda plant, x: np.abs(x @ ROWS.T).max(axis=1)),
         (AdversarialDisturbance(M), lambda plant, x: np.sum(x @ M * x, axis=1)),
     ],

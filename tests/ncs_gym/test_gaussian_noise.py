@@ -48,7 +48,7 @@ def both(plant, **settings):
 @pytest.mark.parametrize("many", [False, True])
 def test_gaussian_noise_is_that_of_the_covariances_and_truncated_noise_is_not(many):
     plant = library_plant(truck_trailer, gamma=0.0, delta=DELTA)
-    covariances = plant.process_noise_cov, plant.measurement_noise_cov, plant.initial_cov
+    covariances = plant.process_noise.covariance, plant.sensor_noise.covariance, plant.initial_noise.covariance
     count = 100 if many else 2000
     for noise in ("gaussian", "truncated"):
         env = both(plant, noise=noise)[many]

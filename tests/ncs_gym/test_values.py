@@ -97,17 +97,14 @@ def test_limits_of_states_and_inputs_together_are_of_the_input_that_acts_then():
 @pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
 @pytest.mark.parametrize("seed", [3, 10, 18])
 def test_what_the_point_lacks_of_rest_is_inside_where_large_pushes_cancel(seed):
-    inner, w = np.random.default_rng(seed).uniform(0.1, 1.0, (2, 2)), np.array([0.3, 0.7])
-    large = 1e12 * np.array([1.0, -(inner[0] @ w) / (inner[1] @ w)])
-    E = np.stack([large, [0.01, 0.02]])
-    plant = LinearPlant(
-        Model(0.5 * np.eye(2), B, None, 0.1), LIMITS, Bounds(Through(E, Through(inner, Box(w, w))), 0, 0)
-    )
+    w = np.random.default_rng(seed).uniform(0.1, 1.0, 2)
+    E = np.stack([1e12 * np.array([1.0, -w[0] / w[1]]), [0.01, 0.02]])
+    plant = LinearPlant(Model(0.5 * np.eye(2), B, None, 0.1), LIMITS, Bounds(Through(E, Box(w, w)), 0, 0))
 
     def times(matrix, vector):
         return [sum(Fraction(a) * b for a, b in zip(row, vector, strict=True)) for row in matrix.tolist()]
 
-    push = times(E, times(inner, [*map(Fraction, w.tolist())]))
+    push = times(E, [*map(Fraction, w.tolist())])
     x, u = ([*map(Fraction, each.tolist())] for each in (plant.operating_state, plant.operating_input))
     terms = zip(times(plant.A, x), times(plant.B, u), push, x, strict=True)
     assert plant.disturbance.gauge([float(Ax + Bu + d - own) for Ax, Bu, d, own in terms]) <= 1.0

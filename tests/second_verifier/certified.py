@@ -122,13 +122,13 @@ def _ellipsoid_conditions(S: Ellipsoid, certificate: Certificate, D: Any, plant:
     L, B = matrix(S.shape_matrix), matrix(plant.B)
     K_rows = [matrix(row) for row in certificate.K]
     yield definite("L > 0", L, strictly=True)
-    for j, row in enumerate(plant.box_rows):
+    for j, row in enumerate(plant.box):
         yield at_least_zero(f"(S) c_{j + 1} L c_{j + 1}' <= 1", 1 - form(matrix(row), L))
     BK, s = B * matrix(certificate.K), number(certificate.rounding)
     moved = mapped(matrix(plant.A) + BK, L)
     # m B diag(r^2) B' is a sum over the columns of B; D_u times s is (1+s) (s D + that).
     rounding = 0 * D
-    for i, limit in enumerate(plant.u_max):
+    for i, limit in enumerate(plant.largest_input):
         column = matrix(plant.B[:, i])
         rounding += plant.m * (FLOAT32 * number(limit)) ** 2 * (column.transpose() * column)
     D_u = (1 + s) * (s * D + rounding)
@@ -140,7 +140,7 @@ def _ellipsoid_conditions(S: Ellipsoid, certificate: Certificate, D: Any, plant:
         unit = lx * le * ld * s
         kept = unit * L - (le * ld * s) * moved - (lx * ld * s) * mapped(BK, Sigma) - (lx * le) * D_u
         yield definite(f"(I) L - (A+BK) L (A+BK)'/lx - BK Sigma K'B'/le - D_u/ld >= 0{label}", kept, unit)
-        for i, (limit, row, value) in enumerate(zip(plant.u_max, K_rows, proof.inputs, strict=True)):
+        for i, (limit, row, value) in enumerate(zip(plant.largest_input, K_rows, proof.inputs, strict=True)):
             mu = number(value)
             allowed = number(limit) ** 2 * (1 - FLOAT32) ** 2
             slack = mu * (1 - mu) * allowed - (1 - mu) * form(row, L) - mu * form(row, Sigma)

@@ -66,9 +66,9 @@ def _set_conditions(
     with ctx.workprec(PRECISION):
         least = alpha.upper().fmpq()
     yield definite("(C2) L >= alpha I", L - least * identity(n))
-    for j, row in enumerate(plant.box_rows):
+    for j, row in enumerate(plant.box):
         yield at_least_zero(f"(C3) c_{j + 1} L c_{j + 1}' <= 1", 1 - form(matrix(row), L))
-    for i, limit in enumerate(plant.u_max):
+    for i, limit in enumerate(plant.largest_input):
         row = matrix(certificate.K[i])
         slack = number(limit) ** 2 / 2 - form(row, L)
         if alpha > 0:
@@ -82,8 +82,8 @@ def _set_conditions(
 def _constants(kappa: Any, rho: Any, plant: LinearPlant) -> tuple[Any, Any, Any]:
     """Returns enclosures of eps_up, eps and alpha (Theorems 2 and 3, Definition 4) with g_bar^2 = kappa rho."""
     g2, gamma = arb(kappa * rho), arb(number(plant.gamma))
-    q_bar = _largest_eigenvalue(matrix(plant.process_noise_cov)) + gamma
-    p0, A = _largest_eigenvalue(matrix(plant.initial_cov)), matrix(plant.A)
+    q_bar = _largest_eigenvalue(matrix(plant.process_noise.covariance)) + gamma
+    p0, A = _largest_eigenvalue(matrix(plant.initial_noise.covariance)), matrix(plant.A)
     quantile = arb(number(plant.process_noise.energy))
     epsilon_up = (p0 * g2 + q_bar / arb(1 - kappa * rho)) * quantile
     norm = _largest_eigenvalue(A.transpose() * A).sqrt()

@@ -36,7 +36,7 @@ def fine_rows(name):
     """Rows of the box on x and u at FINE + 1 times of a step, by scipy, shape (FINE + 1, k, n + m)."""
     plant = found(name)[0]
     n, m = plant.n, plant.m
-    G = np.concatenate([plant.continuous_model, np.zeros((m, n + m))])
+    G = np.concatenate([plant.model.continuous, np.zeros((m, n + m))])
     return plant.box @ np.array([expm(G * (plant.dt * i / FINE))[:n] for i in range(FINE + 1)])
 
 

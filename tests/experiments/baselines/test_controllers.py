@@ -24,7 +24,7 @@ def settled(env, name, K, target, steps=600):
     policy, x = controller(name, env, Fallback.of_gain(K), 0), np.zeros(env.plant.n)
     for _ in range(steps):
         observation = np.append(x, target)[None].astype(np.float32)
-        u = env.plant.u_max * policy(observation, {"estimate": x[None]})[0]
+        u = env.plant.largest_input * policy(observation, {"estimate": x[None]})[0]
         x = env.plant.A @ x + env.plant.B @ u
     return x, u
 
@@ -85,7 +85,7 @@ def test_regulator_of_the_speed_removes_the_error():
     more = np.hstack([error, [[3.0, 0.1], [0.0, 0.2]]]).astype(np.float32)  # an age and a half-width, with observe=
     np.testing.assert_array_equal(regulator(more, estimates), regulator(error, estimates))
     for _ in range(40):
-        u = env.plant.u_max * regulator(np.append(x, left)[None], {"estimate": x[None]})[0]
+        u = env.plant.largest_input * regulator(np.append(x, left)[None], {"estimate": x[None]})[0]
         x, left = env.plant.A @ x + env.plant.B @ u, left - env.plant.dt * u[0]
     assert abs(left) < 0.05
 

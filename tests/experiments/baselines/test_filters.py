@@ -31,7 +31,7 @@ def cases(certificate, loaded):
     """Estimates inside and around S, and inputs within the limits."""
     rng = np.random.default_rng(0)
     estimates = certificate.safe_set.sample_boundary(rng, 400) * rng.uniform(0.0, 1.1, (400, 1))
-    return estimates, rng.uniform(-1.0, 1.0, (400, 1)) * loaded.u_max
+    return estimates, rng.uniform(-1.0, 1.0, (400, 1)) * loaded.largest_input
 
 
 def played(certificate, **filters):
@@ -177,7 +177,7 @@ def test_tubes_are_not_for_limits_of_states_and_inputs_together():
 def test_predictive_filter_applies_the_rest_of_its_plan_and_then_the_gain(certificate, loaded):
     predictive = PredictiveFilter(certificate, loaded, horizon=3)
     inside, outside, zero = np.zeros((1, 2)), 5.0 * loaded.half_widths[None], np.zeros((1, 1))
-    lost = np.clip(outside @ certificate.K.T, -loaded.u_max, loaded.u_max)
+    lost = np.clip(outside @ certificate.K.T, -loaded.largest_input, loaded.largest_input)
     np.testing.assert_array_equal(predictive(outside, zero, ~NEVER), lost)
     pushed = np.full((1, 1), 0.5)
     np.testing.assert_array_equal(predictive(inside, pushed, ~NEVER), pushed)

@@ -49,7 +49,7 @@ def semidefinite_optimum(u_max, quotient):
     constraints = [
         cp.bmat([[CASE.kappa * L, closed.T], [closed, L]]) >> 0,
         cp.bmat(blocks) >> 0,
-        cp.diag(plant.box_rows @ L @ plant.box_rows.T) <= 1.0,
+        cp.diag(plant.box @ L @ plant.box.T) <= 1.0,
     ]
     tolerances = dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-12)
     cp.Problem(cp.Maximize(cp.log_det(L)), constraints).solve(solver=cp.CLARABEL, **tolerances)

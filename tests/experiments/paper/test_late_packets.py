@@ -16,9 +16,12 @@ EVERYWHERE = np.array([True])
 def textbook_filter(mean):
     """Definition 1 by filterpy."""
     kalman = KalmanFilter(dim_x=2, dim_z=2)
-    kalman.x, kalman.P = np.array(mean), np.array(PLANT.initial_cov)
+    kalman.x, kalman.P = np.array(mean), np.array(PLANT.initial_noise.covariance)
     kalman.F, kalman.H = PLANT.A + PLANT.B @ CASE.K, PLANT.H
-    kalman.Q, kalman.R = PLANT.process_noise_cov + PLANT.gamma * np.eye(2), np.array(PLANT.measurement_noise_cov)
+    kalman.Q, kalman.R = (
+        PLANT.process_noise.covariance + PLANT.gamma * np.eye(2),
+        np.array(PLANT.sensor_noise.covariance),
+    )
     return kalman
 
 

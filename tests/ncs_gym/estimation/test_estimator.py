@@ -43,10 +43,10 @@ def sets_of(plant, channel=None):
 def batch_estimate(plant, first, inputs, packets, noise_cov):
     """The last state's mean and covariance from the joint precision of all states: no recursion, no gains."""
     n, steps = plant.n, len(inputs)
-    Q = plant.process_noise_cov + plant.gamma * np.eye(n)
+    Q = plant.process_noise.covariance + plant.gamma * np.eye(n)
     precision = np.zeros((n * (steps + 1), n * (steps + 1)))
     vector = np.zeros(n * (steps + 1))
-    start = np.linalg.inv(plant.initial_cov)
+    start = np.linalg.inv(plant.initial_noise.covariance)
     precision[:n, :n] += start
     vector[:n] += start @ first
     Q_inverse, R_inverse = np.linalg.inv(Q), np.linalg.inv(noise_cov)
@@ -83,7 +83,7 @@ def test_estimate_equals_batch_least_squares_with_late_and_reordered_packets(see
         packets = link.exchange(rng, step, plant.H @ x + plant.sensor_noise.sample(rng))
         used += [(packet.stamp, packet.measurement) for packet in packets]
         estimator.advance(inputs[-1], packets)
-        noise_cov = plant.measurement_noise_cov + 0.001**2 / 12 * np.eye(plant.p)
+        noise_cov = plant.sensor_noise.covariance + 0.001**2 / 12 * np.eye(plant.p)
         mean, covariance = batch_estimate(plant, first, inputs, used, noise_cov)
         np.testing.assert_allclose(estimator.mean, mean, atol=1e-9)
         np.testing.assert_allclose(estimator.covariance, covariance, atol=1e-10)
@@ -98,7 +98,7 @@ def drive(plant, channel, seed, steps, push):
     estimator.reset(x + e0)
     link = ChannelState(channel, rng)
     for step in range(1, steps + 1):
-        u = rng.uniform(-1, 1, plant.m) * plant.u_max
+        u = rng.uniform(-1, 1, plant.m) * plant.largest_input
         e = estimator.mean - x
         d = -plant.disturbance.farthest_point(plant.A @ e, push(rng)) * (1 - 1e-12)
         x = plant.A @ x + plant.B @ u + d
@@ -316,7 +316,7 @@ def test_set_membership_gain_leaves_the_smallest_ellipsoid(p, size):
 def test_covariances_and_gains_are_those_of_filterpy(plant):
     estimator = Estimator(plant, Channel(quantization_step=0.01), certified_error_set(plant, ChannelContract(3, 0.01)))
     estimator.reset(0.01 * np.ones(plant.n))
-    u, y, theirs = 0.1 * plant.u_max, 0.02 * np.ones(plant.p), estimator.as_filterpy()
+    u, y, theirs = 0.1 * plant.largest_input, 0.02 * np.ones(plant.p), estimator.as_filterpy()
     P = estimator.covariance
     theirs.predict(u)
     estimator.advance(u, [])
@@ -335,7 +335,7 @@ def test_perfect_sensors_get_a_little_noise_in_their_own_units(perfect):
     plant = library_plant(
         truck_trailer, H=np.diag([2.0, 3.0]), measurement_noise_cov=np.diag(np.where(perfect, 0.0, 1e-4))
     )
-    noise = ErrorRecursion(plant, 0.0, certified_error_set(plant)).R - plant.measurement_noise_cov
+    noise = ErrorRecursion(plant, 0.0, certified_error_set(plant)).R - plant.sensor_noise.covariance
     np.testing.assert_allclose(noise, FLAT_INFLATION * np.diag((plant.half_widths * [2.0, 3.0]) ** 2), rtol=1e-6)
 
 

@@ -43,7 +43,7 @@ def traffic(plant, channel, rng, steps):
     state, link, sent = np.zeros(plant.n), ChannelState(channel, rng), []
     silent = 0
     for step in range(1, steps + 1):
-        u = rng.uniform(-1.0, 1.0, plant.m) * plant.u_max
+        u = rng.uniform(-1.0, 1.0, plant.m) * plant.largest_input
         state = plant.A @ state + plant.B @ u + plant.nominal_disturbance.sample(rng)
         packets = []
         if link.sends_at(step):

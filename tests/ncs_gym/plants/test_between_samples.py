@@ -27,7 +27,7 @@ PLANTS = {
 def exponentials(plant, times):
     """[A_tau, B_tau] by scipy, shape (len(times), n, n + m)."""
     n, m = plant.n, plant.m
-    G = np.concatenate([plant.continuous_model, np.zeros((m, n + m))])
+    G = np.concatenate([plant.model.continuous, np.zeros((m, n + m))])
     return np.array([expm(G * time)[:n] for time in times])
 
 
@@ -201,10 +201,10 @@ def test_constant_disturbance_is_refused_beside_between_samples_also_where_two_c
 
 def test_model_in_continuous_time_is_the_one_that_was_sampled():
     plant = truck_trailer()
-    for change in ({"A": 0.9 * plant.A}, {"dt": 1.0}, {"continuous_model": 1.1 * plant.continuous_model}):
+    for change in ({"A": 0.9 * plant.A}, {"dt": 1.0}, {"continuous_model": 1.1 * plant.model.continuous}):
         with pytest.raises(ValueError, match="what A and B were sampled from"):
             altered(plant, **change)
-    assert altered(plant, A=0.9 * plant.A, continuous_model=None).continuous_model is None
+    assert altered(plant, A=0.9 * plant.A, continuous_model=None).model.continuous is None
 
 
 def test_violation_between_samples_ends_an_episode_if_violations_do():

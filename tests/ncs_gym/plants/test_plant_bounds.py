@@ -88,7 +88,7 @@ def test_first_error_along_an_oblique_line_is_held_in_rational_arithmetic():
     ],
 )
 def test_covariance_may_lack_the_rounding_of_its_own_type(given):
-    kept = plain(process_noise_cov=given).process_noise_cov
+    kept = plain(process_noise_cov=given).process_noise.covariance
     assert np.array_equal(kept, kept.T)
     np.testing.assert_allclose(kept, given, rtol=2e-6)
     assert is_positive_semidefinite(rational(kept))

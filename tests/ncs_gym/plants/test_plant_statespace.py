@@ -43,7 +43,7 @@ def test_continuous_model_is_sampled_exactly(name):
     end = solve_ivp(lambda _, x: model.A @ x + model.B[:, 0] * 1.7, (0.0, 0.1), [0.4, -0.9], rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(plant.A @ [0.4, -0.9] + plant.B @ [1.7], end.y[:, -1], atol=1e-9)
     np.testing.assert_array_equal(plant.H, model.C)
-    np.testing.assert_array_equal(plant.box_rows, [[1.0, 0.0], [0.0, 0.5]])
+    np.testing.assert_array_equal(plant.box, [[1.0, 0.0], [0.0, 0.5]])
 
 
 def test_model_that_leaves_open_whether_it_is_in_discrete_time_is_refused():
@@ -69,7 +69,7 @@ def test_past_inputs_are_named_by_their_age():
 
 def test_delayed_inputs_are_limited_but_never_count_as_violated():
     plant = sampled_plant((A, B, C, D), dt=0.1, input_delay=2, **(REST | {"u_max": 0.7}))
-    assert np.linalg.matrix_rank(plant.box_rows) == plant.n
+    assert np.linalg.matrix_rank(plant.box) == plant.n
     assert (plant.constraint_values(np.array([0.0, 0.0, 0.7, -0.7])) < -0.5).all()
 
 

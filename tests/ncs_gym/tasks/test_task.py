@@ -91,7 +91,7 @@ def test_farthest_equilibrium_is_that_of_a_search_over_all_inputs():
         angles = np.linspace(0.0, 2.0 * np.pi, 20_001)
         inputs = np.stack([np.cos(angles), np.sin(angles)])
         states = to_state @ inputs
-        used = np.maximum(np.abs(plant.box_rows @ states).max(axis=0), np.abs(inputs.T / plant.u_max).max(axis=1))
+        used = np.maximum(np.abs(plant.box @ states).max(axis=0), np.abs(inputs.T / plant.largest_input).max(axis=1))
         farthest = farthest_equilibrium(plant, output)
         assert farthest == pytest.approx((output @ states / used).max(), rel=1e-3)
         task = SetpointTracking(output=output, reach=(1.0 - 1e-6) * farthest, width=1.0)

@@ -101,7 +101,7 @@ class Between:
 
     def __init__(self, plant: Any) -> None:
         assert (np.abs(plant.box_ends) == 1.0).all()
-        G = np.pad(plant.continuous_model, ((0, plant.m), (0, 0)))
+        G = np.pad(plant.model.continuous, ((0, plant.m), (0, 0)))
         times = plant.dt * np.arange(FINE + 1) / FINE
         self.rows = plant.box @ np.array([expm(G * tau)[: plant.n] for tau in times])
         D = plant.nominal_disturbance.shape_matrix

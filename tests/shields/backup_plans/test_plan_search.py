@@ -28,7 +28,7 @@ def situations(shield, rng, count):
     plant = shield.plant
     estimates = rng.uniform(-1, 1, (count, plant.n)) * plant.half_widths * rng.uniform(0.3, 1.0, (count, 1))
     shapes = shield.certificate.error_shapes[0] * rng.uniform(0.01, 0.5, (count, 1, 1))
-    return estimates, shapes, rng.uniform(-1, 1, (count, plant.m)) * plant.u_max
+    return estimates, shapes, rng.uniform(-1, 1, (count, plant.m)) * plant.largest_input
 
 
 def best_distance(shield, x_hat, shape, proposed, length):
@@ -40,7 +40,7 @@ def best_distance(shield, x_hat, shape, proposed, length):
     root = np.linalg.cholesky(M).T
     u = cp.Variable((length, plant.m))
     constraints, center, power, disturbed = (
-        [cp.abs(u) <= np.tile(plant.u_max, (length, 1))],
+        [cp.abs(u) <= np.tile(plant.largest_input, (length, 1))],
         x_hat,
         np.eye(plant.n),
         0.0,
@@ -48,25 +48,25 @@ def best_distance(shield, x_hat, shape, proposed, length):
     sums = None
     for j in range(length):
         D = power @ plant.disturbance.shape_matrix @ power.T
-        disturbed = disturbed + np.sqrt(np.einsum("ij,jk,ik->i", plant.box_rows, D, plant.box_rows))
+        disturbed = disturbed + np.sqrt(np.einsum("ij,jk,ik->i", plant.box, D, plant.box))
         sums = D if sums is None else outer_sum(sums, D, M)
         center, power = plant.A @ center + plant.B @ u[j], plant.A @ power
-        reach = Ellipsoid(power @ shape @ power.T).support(plant.box_rows) + disturbed
+        reach = Ellipsoid(power @ shape @ power.T).support(plant.box) + disturbed
         if (reach >= 1.0).any():
             return np.inf
         if j < length - 1:
-            constraints.append(cp.abs(plant.box_rows @ center) <= 1.0 - reach)
+            constraints.append(cp.abs(plant.box @ center) <= 1.0 - reach)
     values, axes = np.linalg.eigh(root @ outer_sum(power @ shape @ power.T, sums, M) @ root.T)
     h = np.sqrt(values[-1])
     if h >= 1.0:
         return np.inf
     weights = np.sqrt((1 - h) * h / (h - values))
     constraints.append(cp.norm((weights[:, None] * axes.T @ root) @ center) <= 1.0 - h)
-    problem = cp.Problem(cp.Minimize(cp.sum_squares((u[0] - proposed) / plant.u_max)), constraints)
+    problem = cp.Problem(cp.Minimize(cp.sum_squares((u[0] - proposed) / plant.largest_input)), constraints)
     if plant.m > 1:
-        assert np.ptp(plant.u_max) == 0.0  # or distances in units of the limits would be others
+        assert np.ptp(plant.largest_input) == 0.0  # or distances in units of the limits would be others
     problem.solve(solver=cp.CLARABEL, tol_feas=1e-9, tol_gap_abs=1e-10, tol_gap_rel=1e-10)
-    return plant.u_max[0] * np.sqrt(max(problem.value, 0.0)) if problem.status == cp.OPTIMAL else np.inf
+    return plant.largest_input[0] * np.sqrt(max(problem.value, 0.0)) if problem.status == cp.OPTIMAL else np.inf
 
 
 @pytest.mark.cases(1)
@@ -81,7 +81,7 @@ def test_input_applied_is_as_close_to_the_proposal_as_an_independent_solver_gets
         best = min(best_distance(shield, x_hat, shape, proposed, length) for length in (1, shield.horizon))
         if decision.proved:
             distance = np.linalg.norm(decision.input - proposed)
-            assert distance <= best + 1e-3 * shield.plant.u_max[0]
+            assert distance <= best + 1e-3 * shield.plant.largest_input[0]
             apart.append(distance)
         else:
             # What is missed lies within the reserve that the solver's precision and float32 take.
@@ -109,8 +109,8 @@ def test_plans_are_what_they_say():
             padded[0, 0, : len(plan)] = plan
             certified = test.certified(x_hat[None], test.tightenings_of(shape[None]), padded)[0, 0]
             assert certified[len(plan) - 1]
-            actions = decision.plan / shield.plant.u_max
-            np.testing.assert_array_equal(actions.astype(np.float32) * shield.plant.u_max, decision.plan)
+            actions = decision.plan / shield.plant.largest_input
+            np.testing.assert_array_equal(actions.astype(np.float32) * shield.plant.largest_input, decision.plan)
         else:
             assert len(decision.plan) == 0
     assert {"safe", "planned"} <= seen
@@ -122,9 +122,9 @@ def test_nothing_certified_means_the_next_stored_input_and_without_any_the_gain(
     shield, rng = shield_of(name), np.random.default_rng(2)
     plant = shield.plant
     far, shape = 30.0 * plant.half_widths, 0.1 * shield.certificate.Sigma
-    stored = plant.u_max * rng.uniform(-1, 1, (3, plant.m)).astype(np.float32)
+    stored = plant.largest_input * rng.uniform(-1, 1, (3, plant.m)).astype(np.float32)
     for left in (3, 2, 1):
-        decision = shield.decide(far, shape, plant.u_max, stored)
+        decision = shield.decide(far, shape, plant.largest_input, stored)
         assert decision.reason == "stored"
         assert decision.stored
         assert not decision.proved
@@ -134,7 +134,7 @@ def test_nothing_certified_means_the_next_stored_input_and_without_any_the_gain(
         np.testing.assert_array_equal(decision.plan, stored[1:])
         stored = decision.plan
         assert len(stored) == left - 1
-    decision = shield.decide(far, shape, plant.u_max, stored)
+    decision = shield.decide(far, shape, plant.largest_input, stored)
     assert decision.reason == "fallback"
     assert decision.fallback
     assert not decision.stored
@@ -223,7 +223,7 @@ def test_decisions_one_by_one_equal_those_of_a_batch(name):
     stored = np.full((count, shield.horizon, plant.m), np.nan)
     for plan in stored[::2]:
         length = int(rng.integers(1, shield.horizon))
-        plan[:length] = plant.u_max * rng.uniform(-1, 1, (length, plant.m)).astype(np.float32)
+        plan[:length] = plant.largest_input * rng.uniform(-1, 1, (length, plant.m)).astype(np.float32)
     estimates[::9] *= 3.0
     many = decided_alike(shield, estimates, shapes, proposed, stored)
     assert {"planned", "stored"} <= set(many.reason)

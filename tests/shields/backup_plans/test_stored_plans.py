@@ -55,13 +55,13 @@ def test_a_step_without_the_guard_drops_every_plan(many, goes_on):
 
 def test_a_start_in_the_box_is_decided_to_the_last_digit():
     plant = plan_case("batch reactor", "overtaking")[0]
-    row = plant.box_rows[2] / np.linalg.norm(plant.box_rows[2])
+    row = plant.box[2] / np.linalg.norm(plant.box[2])
     inward, outward = 1.0 - 1e-9, 1.0 + 1e-9
     for scale, inside in ((inward, True), (outward, False)):
-        reached = scale / abs(plant.box_rows[2] @ row)
+        reached = scale / abs(plant.box[2] @ row)
         assert starts_in_box(plant, reached * row) is inside
         shape = np.diag(np.full(plant.n, 1e-4)) + (reached**2 - 1e-4) * np.outer(row, row)
-        assert Ellipsoid(shape).support(plant.box_rows[2]) == pytest.approx(scale, abs=1e-12)
+        assert Ellipsoid(shape).support(plant.box[2]) == pytest.approx(scale, abs=1e-12)
         assert starts_in_box(plant, Ellipsoid(shape)) is inside
     # On a face, where products with rows do not round.
     assert starts_in_box(truck_trailer(), np.array([2.0, -2.0]))
@@ -84,7 +84,7 @@ def planned():
 def test_who_writes_into_a_decision_does_not_change_what_is_stored(planned):
     first = planned.decide(None)  # a controller that failed: the stored plan goes on
     kept = first.plan.copy()
-    first.plan[:] = -planned.filter.plant.u_max
+    first.plan[:] = -planned.filter.plant.largest_input
     for u in kept[:2]:
         planned.receive()
         assert planned.guaranteed
@@ -113,7 +113,7 @@ def test_start_outside_the_safe_set_is_guaranteed_exactly_if_a_first_plan_is_cer
         start = rng.uniform(-1.0, 1.0, plant.n) * plant.half_widths * rng.choice([0.3, 0.9, 1.05])
         _, info = shield.reset(seed=seed, options={"state": start})
         outside = not certificate.safe_set.contains(start)
-        if (np.abs(plant.box_rows @ start) > 1.0).any():
+        if (np.abs(plant.box @ start) > 1.0).any():
             assert not info["shield_guaranteed"]
             assert info["shield_reason"] == NOT_KNOWN_INSIDE
         elif outside:
@@ -135,7 +135,7 @@ def test_what_is_no_plan_counts_as_none_of_many_loops_too(wrong):
     )
     lost = np.full((2, plant.n), 10.0) * plant.half_widths  # no plan is found
     proposals, stored = np.array([[np.nan], [0.0]]), np.full((2, horizon, plant.m), np.nan)
-    stored[:, :4] = 0.1 * plant.u_max
+    stored[:, :4] = 0.1 * plant.largest_input
     decided = made.decide_many(lost, error, proposals, stored)
     np.testing.assert_array_equal(decided.reason, "stored")
     stored[:, 0] = wrong

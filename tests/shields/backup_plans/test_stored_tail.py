@@ -33,12 +33,12 @@ class World:
         """A step in which the controller fails, so that what is stored is applied; returns the decision."""
         decision = self.loop.decide(None)
         nominal = self.plant.A @ self.x + self.plant.B @ decision.input
-        row = self.plant.box_rows[np.argmax(np.abs(self.plant.box_rows @ nominal))]
+        row = self.plant.box[np.argmax(np.abs(self.plant.box @ nominal))]
         self.x = nominal + self.plant.nominal_disturbance.extreme_point(np.sign(row @ nominal) * row)
         noise = self.plant.sensor_noise.bound.sample_boundary(self.rng)
         sample = Packet(self.loop.steps + 1, self.plant.H @ self.x + (1.0 - 1e-9) * noise, self.loop.episode)
         self.loop.receive([sample] if heard else [])
-        assert np.abs(self.plant.box_rows @ self.x).max() <= 1.0
+        assert np.abs(self.plant.box @ self.x).max() <= 1.0
         return decision
 
 

@@ -25,11 +25,11 @@ def reduced(plant, bounds):
     constraints = [
         cp.bmat([[bounds.kappa * L, closed.T], [closed, L]]) >> 0,
         L >> bounds.alpha * identity,
-        cp.diag(plant.box_rows @ L @ plant.box_rows.T) <= 1.0,
+        cp.diag(plant.box @ L @ plant.box.T) <= 1.0,
         L >> beta * identity,
         L << bounds.rho * beta * identity,
     ]
-    for i, limit in enumerate(plant.u_max):
+    for i, limit in enumerate(plant.largest_input):
         row, half = F[i : i + 1, :], np.array([[limit**2 / 2.0]])
         constraints.append(cp.bmat([[half, row, row], [row.T, L, zero], [row.T, zero, quotient]]) >> 0)
     problem = cp.Problem(cp.Maximize(cp.log_det(L)), constraints)
@@ -75,7 +75,7 @@ def test_solution_meets_the_printed_constraints():
     assert np.linalg.eigvalsh(bounds.kappa * L - closed @ L @ closed.T)[0] >= -tolerance
     assert np.linalg.eigvalsh(L)[0] >= bounds.alpha
     assert np.linalg.cond(L) <= bounds.rho * (1 + tolerance)
-    assert max(row @ L @ row for row in SMALL.box_rows) <= 1.0
+    assert max(row @ L @ row for row in SMALL.box) <= 1.0
     used = (K @ L @ K.T).item() + np.square(K @ L).sum() * bounds.epsilon_up / bounds.alpha**2
     assert used <= 8.0
 

@@ -69,7 +69,7 @@ def test_margin_of_a_gain_is_what_errors_and_disturbances_reach_together(seed):
     margin, D = tolerance.of(K).margin, plant.disturbance.shape_matrix
     closed_loop, reached = plant.A + plant.B @ K, []
     inputs = K / plant.input_half[:, None]
-    for number, row in enumerate((*plant.box_rows, *inputs)):
+    for number, row in enumerate((*plant.box, *inputs)):
         x, pushes = np.zeros(2), [row]
         while np.abs(pushes[-1] / row.max()).max() > 1e-12:
             pushes.append(pushes[-1] @ closed_loop)
@@ -80,7 +80,7 @@ def test_margin_of_a_gain_is_what_errors_and_disturbances_reach_together(seed):
             d = D @ push / np.sqrt(push @ D @ push)
             x = closed_loop @ x + plant.B @ (K @ e) + d
         used = row @ x
-        if number >= len(plant.box_rows):
+        if number >= len(plant.box):
             used += max(np.sqrt(row @ S @ row) for S in errors)
         reached.append(used)
     assert 1.0 / max(reached) == pytest.approx(margin, rel=1e-6)

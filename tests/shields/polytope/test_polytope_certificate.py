@@ -135,7 +135,7 @@ def assert_polytope_holds(seed, n, m):
     x = wide.safe_set.sample_boundary(rng, 300)
     error, push = wide.error_set.sample_boundary(rng, 300), plant.disturbance.sample_boundary(rng, 300)
     u = (x + error) @ wide.K.T
-    assert (np.abs(u) <= plant.u_max).all()
+    assert (np.abs(u) <= plant.largest_input).all()
     assert wide.safe_set.gauge(x @ plant.A.T + u @ plant.B.T + push).max() <= 1.0
     # By another route: for every row the farthest state, error and disturbance.
     for row in wide.safe_set.rows:

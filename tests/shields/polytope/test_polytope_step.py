@@ -31,7 +31,7 @@ def situations(shield, count, seed=0):
     rng = np.random.default_rng(seed)
     polytope, plant = shield.certificate.safe_set, shield.plant
     estimates = polytope.sample_boundary(rng, count) * rng.uniform(0.3, 1.15, (count, 1))
-    return estimates, 0.5 * shield.certificate.Sigma, rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.u_max
+    return estimates, 0.5 * shield.certificate.Sigma, rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.largest_input
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])

@@ -106,7 +106,7 @@ def test_exception_in_a_loop_stops_it_until_the_next_start(mode, name, monkeypat
     assert loop.guaranteed
 
 
-DATA = np.zeros(2), np.ones((4, len(PLANT.box_rows))), np.eye(2), 1.0, np.empty((4, 0)), np.zeros(1)
+DATA = np.zeros(2), np.ones((4, len(PLANT.box))), np.eye(2), 1.0, np.empty((4, 0)), np.zeros(1)
 
 
 @pytest.mark.parametrize("raised", RAISED)

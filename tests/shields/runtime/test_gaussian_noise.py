@@ -35,7 +35,7 @@ def test_shield_goes_on_when_draws_leave_their_ellipsoids(name, mode):
         reasons |= set(info["shield_reason"].tolist())
         # An alarm ends the proof at once; without one the flag cannot know what no packet showed.
         assert not (info["shield_guaranteed"] & info["assumption_violated"]).any()
-        assert (np.abs(info["input"]) <= plant.u_max).all()
+        assert (np.abs(info["input"]) <= plant.largest_input).all()
     assert escaped
     assert alarms > 0
     assert ALARM in reasons

@@ -61,7 +61,7 @@ def cases(certificate, plant, rng, count):
         flat = turn @ np.diag(10.0 ** rng.uniform(-6, 0, plant.n)) @ turn.T
         shape = flat * rng.uniform(0.01, 1.0) / np.linalg.eigvalsh(np.linalg.solve(certificate.Sigma, flat)).real.max()
         estimate = 1.2 * certificate.safe_set.sample(rng)
-        yield estimate, 0.5 * (shape + shape.T), rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random()
+        yield estimate, 0.5 * (shape + shape.T), rng.uniform(-1, 1, plant.m) * plant.largest_input * rng.random()
 
 
 def test_margin_is_that_of_the_formula(case):
@@ -105,8 +105,8 @@ def test_smallest_test_margin_is_that_of_the_worst_input(case, monkeypatch):
     test, rng = ellipsoid_test(certificate.safe_set.shape_matrix, plant), np.random.default_rng(3)
     for estimate, shape, _ in cases(certificate, plant, rng, 30):
         sets = reachable(test, estimate, shape)
-        inputs = rng.uniform(-1, 1, (500, plant.m)) * plant.u_max
-        corners = np.sign(inputs) * plant.u_max
+        inputs = rng.uniform(-1, 1, (500, plant.m)) * plant.largest_input
+        corners = np.sign(inputs) * plant.largest_input
         smallest = sets.smallest_test_margin().item()
         assert (sets.margins(inputs.T)[0] >= smallest - 1e-12).all()
         assert sets.margins(corners.T)[0].min() == pytest.approx(smallest, abs=1e-12)
@@ -175,7 +175,7 @@ def test_bounds_on_rounding_hold_column_by_column():
     for state, error in ((estimate, shape), (1e3 * estimate, shape), (0.0 * estimate, 10 * shape)):
         known, reach = errors_of(test, error).radius.item(), test.columns @ np.abs(state)
         assert known - reachable(test, state, error).radius.item() == pytest.approx(test.rounding * reach, abs=3e-16)
-        pushed = np.linalg.norm(G @ np.abs(plant.B), axis=0) @ plant.u_max
+        pushed = np.linalg.norm(G @ np.abs(plant.B), axis=0) @ plant.largest_input
         assert errors_of(still, error).radius.item() - known == pytest.approx(test.rounding * pushed, rel=1e-6)
         spread = test.rounding * test.columns @ np.sqrt(np.diag(error))  # which enlarges h a little, too
         assert spread < errors_of(certain, error).radius.item() - known < 2.0 * spread

@@ -32,7 +32,7 @@ class World:
     def __init__(self, loop, state=None, seed=0):
         self.loop, self.plant, self.rng = loop, loop.filter.plant, np.random.default_rng(seed)
         self.state = np.zeros(self.plant.n) if state is None else state
-        self.actuator = Actuator(loop.input_delay, self.plant.m, self.plant.u_max)
+        self.actuator = Actuator(loop.input_delay, self.plant.m, self.plant.largest_input)
         self.packets, self.echoes, self.step = [], [], 0
 
     def start(self, **settings):

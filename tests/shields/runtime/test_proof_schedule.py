@@ -48,7 +48,7 @@ def certificate() -> Any:
 @cache
 def times() -> np.ndarray:
     """[A_tau B_tau] at 201 times of a step, by scipy."""
-    G = np.pad(swing().continuous_model, ((0, 1), (0, 0)))
+    G = np.pad(swing().model.continuous, ((0, 1), (0, 0)))
     return np.array([expm(G * tau)[:2] for tau in np.linspace(0.0, swing().dt, 201)])
 
 

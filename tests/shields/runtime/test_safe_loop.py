@@ -40,7 +40,7 @@ def pushed(plant, x, u, direction):
 def test_another_input_than_decided_is_told_or_found_out(told):
     loop, x, reasons = started(channel=Channel()), np.zeros(2), []
     for _ in range(30):
-        decision = loop.decide(0.5 * loop.filter.plant.u_max)
+        decision = loop.decide(0.5 * loop.filter.plant.largest_input)
         applied = -decision.input
         x = pushed(loop.filter.plant, x, applied, -np.ones(2))
         packet = Packet(loop.steps + 1, x)
@@ -76,7 +76,7 @@ def test_unusable_report_of_the_actuator_ends_the_guarantee_and_keeps_the_estima
 
 def test_proposals_beyond_the_limits_are_clipped():
     loop = started()
-    limit = float(loop.filter.plant.u_max[0])
+    limit = float(loop.filter.plant.largest_input[0])
     decision = loop.decide(limit * (1.0 + 1e-9))
     assert decision.reason == "safe"
     np.testing.assert_array_equal(decision.input, [limit])

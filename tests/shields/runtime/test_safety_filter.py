@@ -32,7 +32,7 @@ def case(request):
 def test_an_input_that_passes_is_returned_untouched(case):
     plant, certificate = case
     shield = safety_filter(certificate, plant)
-    u = 1e-3 * plant.u_max
+    u = 1e-3 * plant.largest_input
     decision = shield.decide(np.zeros(plant.n), 0.01 * certificate.Sigma, u)
     assert not decision.intervened
     np.testing.assert_array_equal(decision.input, u)
@@ -47,19 +47,19 @@ def test_projected_input_is_expressible_in_float32_and_the_closest(case):
     checked = 0
     for _ in range(200):
         estimate = 1.2 * certificate.safe_set.sample(rng)
-        wanted = rng.uniform(-1, 1, plant.m) * plant.u_max
+        wanted = rng.uniform(-1, 1, plant.m) * plant.largest_input
         shape = 0.3 * certificate.Sigma
         decision = shield.decide(estimate, shape, wanted)
         if decision.reason != "projected":
             continue
         checked += 1
         assert (decision.intervened, decision.proved, decision.fallback) == (True, True, False)
-        action = (decision.input / plant.u_max).astype(np.float32)
-        np.testing.assert_array_equal(plant.u_max * action.astype(np.float64), decision.input)
+        action = (decision.input / plant.largest_input).astype(np.float32)
+        np.testing.assert_array_equal(plant.largest_input * action.astype(np.float64), decision.input)
         # No random admissible input is closer by more than the rounding.
         sets = shield.test.reachable(estimate[:, None], shield.errors_of(shape).batch())
         near = decision.input + (wanted - decision.input) * rng.uniform(0, 1, (100, 1))
-        others = np.vstack([rng.uniform(-1, 1, (400, plant.m)) * plant.u_max, near])
+        others = np.vstack([rng.uniform(-1, 1, (400, plant.m)) * plant.largest_input, near])
         admissible = sets.margins(others.T)[0] >= 0.0
         distances = np.linalg.norm(others - wanted, axis=1)
         best = distances[admissible].min(initial=np.inf)
@@ -187,7 +187,7 @@ def test_monitor_never_changes_the_input_and_counts_what_switch_would_do(case):
     rng, counted = np.random.default_rng(6), 0
     for _ in range(200):
         estimate, shape = 1.3 * certificate.safe_set.sample(rng), certificate.Sigma * rng.uniform(0.05, 1.0)
-        u = rng.uniform(-1, 1, plant.m) * plant.u_max * rng.random()
+        u = rng.uniform(-1, 1, plant.m) * plant.largest_input * rng.random()
         watched, switched = monitor.decide(estimate, shape, u), switch.decide(estimate, shape, u)
         np.testing.assert_array_equal(watched.input, u)
         assert watched.intervened == switched.intervened
@@ -206,9 +206,9 @@ def test_boundary_lets_an_input_pass_only_where_every_input_would(case):
     seen = set()
     for _ in range(120):
         estimate, shape = certificate.safe_set.sample(rng) * rng.uniform(0, 1.2), 0.1 * certificate.Sigma
-        u = rng.uniform(-1, 1, plant.m) * plant.u_max
+        u = rng.uniform(-1, 1, plant.m) * plant.largest_input
         decision = boundary.decide(estimate, shape, u)
-        corners = np.array(list(product(*((-limit, limit) for limit in plant.u_max))))
+        corners = np.array(list(product(*((-limit, limit) for limit in plant.largest_input))))
         all_pass = all(switch.decide(estimate, shape, corner).reason == "safe" for corner in corners)
         assert (decision.reason == "safe") is all_pass
         seen.add(decision.reason)
@@ -246,12 +246,12 @@ def random_cases(rng, shield, count):
     inner = rng.standard_normal((count, plant.n, plant.n)) * np.exp(rng.uniform(-4.0, 1.0, (count, 1, 1)))
     inner[::5, :, 0] *= 1e-8  # flat ones
     shapes = factor @ inner @ inner.swapaxes(1, 2) @ factor.T
-    inputs = rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.u_max
-    inputs[::7] = plant.u_max
+    inputs = rng.uniform(-1.0, 1.0, (count, plant.m)) * plant.largest_input
+    inputs[::7] = plant.largest_input
     inputs[::11] = [gained(shield, estimate) for estimate in estimates[::11]]
     estimates[3], estimates[4], estimates[5, 0], estimates[6] = 1e200, np.nan, np.inf, 0.0
     shapes[8], shapes[9], shapes[10], shapes[12, 0, 0] = 0.0, np.nan, -shapes[10], np.inf
-    inputs[13, -1], inputs[14], inputs[15, 0] = np.nan, 1.1 * plant.u_max, -np.inf
+    inputs[13, -1], inputs[14], inputs[15, 0] = np.nan, 1.1 * plant.largest_input, -np.inf
     return estimates, shapes, inputs
 
 

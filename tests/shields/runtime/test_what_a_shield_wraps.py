@@ -107,7 +107,7 @@ def test_no_wrapper_inside_the_shield_breaks_its_promise(name, mode):
             action = np.full(1, rng.choice([-1.0, 1.0]) if step % 20 < 5 else 1.0, np.float32)
             env.step(action)
             belief = env.unwrapped.belief
-            assert np.abs(PLANT.box_rows @ env.unwrapped.state).max() <= 1.0
+            assert np.abs(PLANT.box @ env.unwrapped.state).max() <= 1.0
             assert env.unwrapped.guard.code == 0
             assert belief.applied.flags.writeable is False
             broken += bare.step(action)[4]["cost"]

@@ -19,9 +19,7 @@ def slow(*values):
 
 
 def area_fraction(certificate, plant):
-    return np.sqrt(
-        np.linalg.det(certificate.safe_set.shape_matrix) / np.linalg.det(largest_box_ellipsoid(plant.box_rows))
-    )
+    return np.sqrt(np.linalg.det(certificate.safe_set.shape_matrix) / np.linalg.det(largest_box_ellipsoid(plant.box)))
 
 
 SIZES = [(n, m, seed) for n in (1, 2, 3, 4) for m in (1, 2) for seed in range(2)]

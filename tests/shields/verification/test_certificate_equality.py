@@ -54,8 +54,9 @@ def test_tolerated_scale_is_one_that_some_certificate_exists_for(loaded, certifi
     assert f"up to {scale:.2f} times those assumed" in " ".join(str(certificate).split())
 
     def scaled(factor):
+        noises = loaded.process_noise, loaded.sensor_noise, loaded.initial_noise
         names = ("process_noise_cov", "measurement_noise_cov", "initial_cov")
-        bounds = {name: factor**2 * getattr(loaded, name) for name in names}
+        bounds = {name: factor**2 * each.covariance for name, each in zip(names, noises, strict=True)}
         return altered(loaded, gamma=factor**2 * loaded.gamma, **bounds)
 
     assert synthesize(scaled(0.99 * scale)).provenance["tolerated_scale"] == pytest.approx(1 / 0.99, rel=1e-2)
