@@ -64,15 +64,7 @@ class Box(UncertainSet):
         return Box(np.full(size, self.low), np.full(size, self.high))
 
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
-        return self.through(np.eye(self.size or 1))
-
-    def through(self, E: np.ndarray) -> Ellipsoid:
-        """Returns the smallest ellipsoid around {E z}, q E diag(h^2) E' with q the number of half-widths h > 0."""
-        half = np.broadcast_to(self.half, E.shape[1])
-        scaled = E * half
-        if ((E != 0.0) & (half != 0.0) & (np.abs(scaled) < SMALLEST_SIZE)).any():
-            raise ValueError(f"the entries of E diag(half-widths) must be 0 or at least {SMALLEST_SIZE:g} in size")
-        return Ellipsoid(np.count_nonzero(half) * exact.product(scaled, scaled.T))
+        return Through(np.eye(self.size or 1), self).ellipsoid()
 
     def support(self, direction: np.ndarray) -> Any:  # noqa: D102
         return np.abs(direction) @ np.atleast_1d(self.half)
@@ -113,7 +105,7 @@ class Gaussian(UncertainSet):
 
 @dataclass(frozen=True, eq=False)
 class Through(UncertainSet):
-    """{E w : w in a set}, E of shape (n, q); no Gaussian, which is one of covariance E P E', and no remainder."""
+    """{E w : w in a box}, E of shape (n, q): half-widths or a `Box`; through E another set is `Ellipsoid(E P E')`."""
 
     E: Any
     set: Any
@@ -121,17 +113,17 @@ class Through(UncertainSet):
     def __post_init__(self) -> None:
         E = as_matrix(self.E, (None, None), "E of a set through E")
         own = as_set(self.set).sized(E.shape[1])
-        if any(isinstance(each, Gaussian) or each.is_left_out for each in Sum((own,)).parts):
-            raise ValueError("Through takes no Gaussian, of which E P E' is a covariance, and no remainder")
-        if np.any(own.middle) and not isinstance(own, Box):
-            raise ValueError("Through takes a set with two different ends if that is a Box: give its ends, and one E")
-        self._set(E=E, set=own, size=len(E), middle=E @ np.broadcast_to(own.middle, E.shape[1]))
-        self.ellipsoid()
+        if not isinstance(own, Box):
+            raise ValueError(f"Through takes half-widths or a Box, and of others Ellipsoid(E P E'), got {shown(own)}")
+        scaled = E * own.half
+        if ((E != 0.0) & (own.half != 0.0) & (np.abs(scaled) < SMALLEST_SIZE)).any():
+            raise ValueError(f"the entries of E diag(half-widths) must be 0 or at least {SMALLEST_SIZE:g} in size")
+        self._set(E=E, set=own, size=len(E), middle=E @ own.middle)
 
-    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
-        if isinstance(self.set, Box):
-            return self.set.through(self.E)
-        return Ellipsoid(exact.product(self.E, self.set.ellipsoid().shape_matrix, self.E.T))
+    def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:
+        """Returns the smallest one around, q E diag(h^2) E' with q the number of half-widths h > 0."""
+        scaled = self.E * self.set.half
+        return Ellipsoid(np.count_nonzero(self.set.half) * exact.product(scaled, scaled.T))
 
     def support(self, direction: np.ndarray) -> Any:  # noqa: D102
         return self.set.support(direction @ self.E)

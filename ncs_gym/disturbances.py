@@ -203,7 +203,7 @@ def _unit_ball(dim: int) -> Ellipsoid:
 
 def _declared(plant: LinearPlant) -> Ellipsoid | None:
     """Returns the plant's declared bound of disturbances; None if there is none or it is a point."""
-    bound = plant.disturbance_bound
+    bound = plant.of_disturbance.bound
     return bound if bound is not None and np.any(bound.shape_matrix) else None
 
 

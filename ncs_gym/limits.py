@@ -249,21 +249,12 @@ class LimitValues(ReadOnlyArrays):
         n, m = self.B.shape
         two_ends = np.isfinite(self.box_ends).all(axis=0)
         limited, reach = self.box[two_ends].any(axis=0), np.full(n, np.inf)
-        with suppress(ZeroDivisionError):  # rows that limit a sum alone
-            reach[limited] = self.widest(limited)
+        with suppress(ZeroDivisionError):  # rows C with two ends, x = (C'C)^-1 C' (C x), that limit a sum alone
+            sizes = np.abs(self.box_ends[:, two_ends]).max(axis=0)
+            reach[limited] = (np.abs(exact.pseudoinverse(self.box[two_ends][:, limited])) * sizes).sum(axis=1)
         reach = np.minimum(reach, np.abs(self.own_limits).max(axis=0))
         reach[n - self.past :] = np.tile(self.largest_input, self.past // m)
         return read_only(np.concatenate([reach, self.largest_input]))
-
-    def widest(self, states: Any = slice(None)) -> np.ndarray:
-        """Returns bounds of some |x_i| in the safe box by x = (C'C)^-1 C' (C x), C having two ends.
-
-        Raises:
-            ZeroDivisionError: If the box does not bound each of these.
-        """
-        bounded = np.isfinite(self.box_ends).all(axis=0)
-        rows, sizes = self.box[:, states][bounded], np.abs(self.box_ends[:, bounded]).max(axis=0)
-        return (np.abs(exact.pseudoinverse(rows)) * sizes).sum(axis=1)
 
     def constraint_values(self, state: np.ndarray) -> np.ndarray:
         """Returns how far c_j x is beyond the nearer end, in units of half the range, shape (k,) or (k, N).

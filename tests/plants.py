@@ -99,10 +99,14 @@ def named(name: str) -> tuple[LinearPlant, ChannelContract | None]:
     return NAMED[name]()
 
 
+# Where a plant has what the adapter of tests calls so.
+SOURCES = {"disturbance_bound": "of_disturbance", "sensor_bound": "of_sensor", "initial_bound": "of_first_error"}
+
+
 def with_radii(plant: LinearPlant, factor: float) -> LinearPlant:
     """The plant with the radii of its declared disturbances, sensor noise and first errors multiplied."""
     own = plant.n - plant.past
     sizes = {"disturbance_bound": own, "sensor_bound": plant.p, "initial_bound": own}
-    given = {name: bound.shape_matrix for name in sizes if (bound := getattr(plant, name)) is not None}
+    given = {name: bound.shape_matrix for name in sizes if (bound := getattr(plant, SOURCES[name]).bound) is not None}
     scaled = {name: Ellipsoid(factor**2 * D[: sizes[name], : sizes[name]]) for name, D in given.items()}
     return altered(plant, gamma=factor**2 * plant.gamma, **scaled)

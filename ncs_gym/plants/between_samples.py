@@ -40,8 +40,7 @@ def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
         raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")
     points, n, m = plant.limits.between_samples or 1, plant.n, plant.m
     G, h = np.concatenate([plant.model.continuous, np.zeros((m, n + m))]), plant.dt / points
-    box, W = np.pad(plant.box, ((0, 0), (0, m))), np.concatenate([plant.widest(), plant.largest_input])
-    size, D = np.abs(G), plant.disturbance.shape_matrix
+    box, W, size, D = np.pad(plant.box, ((0, 0), (0, m))), plant.reach, np.abs(G), plant.disturbance.shape_matrix
     try:
         onward = [np.eye(n + m), *(exact.exponential(G, plant.dt * i / points) for i in range(1, points))]
         growth = float(exact.exponential(np.array([[_logarithmic_norm(G, W)]]), h)[0, 0])

@@ -7,13 +7,14 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from ncs_gym import exact
 from ncs_gym.bounds import Ball, Bounds, Box, Gaussian, Sum, as_set
-from ncs_gym.ellipsoid import Ellipsoid, TruncatedGaussian, UncertainSet, outer_sum
+from ncs_gym.ellipsoid import Ellipsoid, UncertainSet, outer_sum
 from ncs_gym.limits import sides
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.validation import (
@@ -328,9 +329,9 @@ SAME = 1e-9
 _SAME = {
     **{name: name for name in ("H", "dt", "between_samples", "delta")},
     "past": "delay, or a rate",
-    **dict.fromkeys(("gamma", "process_noise"), "Bounds(disturbance=...)"),
-    **dict.fromkeys(("sensor_noise", "sensor_bound"), "Bounds(sensor=...)"),
-    **dict.fromkeys(("initial_noise", "initial_bound"), "Bounds(first_error=...)"),
+    **dict.fromkeys(("gamma", "process_noise.covariance"), "Bounds(disturbance=...)"),
+    **dict.fromkeys(("sensor_noise.covariance", "of_sensor.bound"), "Bounds(sensor=...)"),
+    **dict.fromkeys(("initial_noise.covariance", "of_first_error.bound"), "Bounds(first_error=...)"),
     **dict.fromkeys(("state_names", "state_units", "input_names", "input_units"), "labels"),
 }
 # Bounds of disturbances that hold this rounding agree to this, relative to the terms of a step.
@@ -381,7 +382,7 @@ def family(
     own = np.array([np.hstack([each.model.A, each.model.B]) for each in plants])
     middle = 0.5 * (own.min(axis=0) + own.max(axis=0))  # exact where all are the same
     model = replace(first.model, A=middle[:, :n], B=middle[:, n:], offset=None, continuous=None)
-    bounds = first.bounds if shared.cover is first.disturbance_bound else _with_bound(first, shared.cover)
+    bounds = first.bounds if shared.cover is first.of_disturbance.bound else _with_bound(first, shared.cover)
     remainder = Remainder(Ellipsoid(np.zeros((n, n))), True, "", replace(found, at_rest=rest_matters))
     return LinearPlant(model, first.limits, replace(bounds, disturbance=bounds.disturbance + remainder), first.labels)
 
@@ -412,7 +413,7 @@ def _around_center(plant: LinearPlant, center: np.ndarray) -> LinearPlant:
     about = (np.concatenate(pair) for pair in (own, (plant.model.state, plant.model.input)))
     if all(np.array_equal(np.concatenate(point), each) for each in about):
         return plant
-    bounds = _with_bound(plant, plant.disturbance_bound)
+    bounds = _with_bound(plant, plant.of_disturbance.bound)
     model, limits = replace(plant.model, at=point, offset=None), plant.limits.absolute(plant.model)
     return replace(plant, model=model, limits=limits, bounds=bounds)
 
@@ -427,7 +428,7 @@ def _covering(plants: Sequence[LinearPlant]) -> Ellipsoid | None:
     shape = _disturbance_shape(first)
     are_equal = all(np.array_equal(shape, _disturbance_shape(each)) for each in plants)
     if are_equal and not any(each.step_offset.any() for each in plants):
-        return first.disturbance_bound
+        return first.of_disturbance.bound
     widths = _terms(first)
     size = np.sqrt((np.abs(shape) / (widths * widths[:, None])).sum(axis=1))
     return Ellipsoid(shape + np.diag((2.0 * size + SAME_BOUND) * SAME_BOUND * widths**2))
@@ -443,7 +444,7 @@ def _is_covered(first: LinearPlant, cover: Ellipsoid | None, plant: LinearPlant)
 
 
 def _disturbance_shape(plant: LinearPlant) -> np.ndarray:
-    bound = plant.disturbance_bound
+    bound = plant.of_disturbance.bound
     return np.zeros((plant.n, plant.n)) if bound is None else bound.shape_matrix
 
 
@@ -543,7 +544,7 @@ class _Shared:
         names = [
             given
             for name, given in (_ROUNDED | _SAME).items()
-            if not _is_same(getattr(self.first, name), getattr(moved, name), SAME if name in _ROUNDED else 0.0)
+            if not _is_same(attrgetter(name)(self.first), attrgetter(name)(moved), SAME if name in _ROUNDED else 0.0)
         ]
         if not names and not _is_covered(self.first, self.cover, plant):
             names = ["Bounds(disturbance=...)"]
@@ -552,8 +553,6 @@ class _Shared:
 
 
 def _is_same(one: Any, other: Any, tolerance: float) -> bool:
-    if isinstance(one, TruncatedGaussian):
-        one, other = one.covariance, other.covariance
     one, other = (each.shape_matrix if isinstance(each, Ellipsoid) else each for each in (one, other))
     if tolerance:
         return one.shape == other.shape and np.allclose(one, other, rtol=tolerance, atol=0.0)

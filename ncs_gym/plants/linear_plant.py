@@ -137,6 +137,7 @@ class LinearPlant(LimitValues):
         bounds: Each a sum of sets.
         labels: Names of states and inputs with their units, {"states": {"angle": "rad"}, "inputs": {"voltage": "V"}}.
         region: Digest of the model and the limits, which a remainder belongs to.
+        fingerprint: SHA-256 over every number that proofs and simulations take of it, the same on every machine.
         state_names, state_units, input_names, input_units: The labels, with defaults.
         dt, continuous_model, between_samples: Those of the model and the limits.
         kept_ends: Ends of `box` that proofs keep at the sampling instants, shape (2, k): `box_ends`, or closer ones
@@ -148,6 +149,7 @@ class LinearPlant(LimitValues):
         n, m, p: Number of states, inputs and outputs.
         of_disturbance, of_sensor, of_first_error: What is declared of each; other attributes name parts of these.
         remainder: What the model leaves out of the process that really moves; None if nothing.
+        members: The `Family` of which it is the middle; None for a plant that stands for itself.
         delta: Probability that Gaussian noise is truncated at.
 
     Raises:
@@ -159,6 +161,7 @@ class LinearPlant(LimitValues):
     bounds: Bounds
     labels: Mapping[str, Any] | None = None
     region: str = field(init=False)
+    fingerprint: str = field(init=False)
     state_names: tuple[str, ...] = field(init=False)
     state_units: tuple[str, ...] = field(init=False)
     input_names: tuple[str, ...] = field(init=False)
@@ -170,6 +173,7 @@ class LinearPlant(LimitValues):
     of_sensor: Source = field(init=False)
     of_first_error: Source = field(init=False)
     remainder: Any = field(init=False)
+    members: Any = field(init=False)
     kept_ends: np.ndarray = field(init=False)
     arriving: np.ndarray = field(init=False)
     step_rows: np.ndarray = field(init=False)
@@ -182,9 +186,6 @@ class LinearPlant(LimitValues):
     process_noise = setting("process_noise", "of_disturbance.noise")
     sensor_noise = setting("sensor_noise", "of_sensor.noise")
     initial_noise = setting("initial_noise", "of_first_error.noise")
-    disturbance_bound = setting("disturbance_bound", "of_disturbance.bound")
-    sensor_bound = setting("sensor_bound", "of_sensor.bound")
-    initial_bound = setting("initial_bound", "of_first_error.bound")
 
     def __post_init__(self) -> None:
         for name, kind in _VALUES.items():
@@ -192,11 +193,10 @@ class LinearPlant(LimitValues):
                 raise ValueError(f"{name} must be a {kind.__name__}, got {shown(getattr(self, name))}")
         model, n = self.model, len(self.model.A)
         sums = self.bounds.sums(n, len(model.H))
-        declared = sums[0].declared
-        rest = self.limits.around(model).at_rest(declared.sized(n))
+        declared, rest = sums[0].declared, self.limits.around(model).at_rest(sums[0].declared.sized(n))
         region = model.A, model.B, model.dt, rest.box, *rest.box_ends, rest.input_ends
         region += rest.mixed_rows, *rest.mixed_ends
-        self._set(bounds=Bounds(*sums), remainder=None, region=_digest(enumerate(region)))
+        self._set(bounds=Bounds(*sums), remainder=None, members=None, region=_digest(enumerate(region)))
         whole = rest.with_past_inputs(model.delays, self.limits.change_within(rest.input_half))
         self._set(**vars(whole), n=len(whole.A), m=whole.B.shape[1], p=len(whole.H))
         self._declare([declared, *sums[1:]], rest)
@@ -207,7 +207,8 @@ class LinearPlant(LimitValues):
             self._set(**kept_at_all_times(self))
         if owned := [each.of_plant(self) for each in sums[0].parts if each.is_left_out]:
             disturbance = Sum((*declared.parts, *owned))
-            self._set(remainder=owned[0], bounds=replace(self.bounds, disturbance=disturbance))
+            self._set(remainder=owned[0], members=owned[0].family, bounds=replace(self.bounds, disturbance=disturbance))
+        self._set(fingerprint=self.digest())
 
     def _declare(self, sums: list[Sum], rest: LimitValues) -> None:
         n, past = len(rest.A), self.past
@@ -329,18 +330,7 @@ class LinearPlant(LimitValues):
 
     def __repr__(self) -> str:
         """Short, since messages and settings of others contain it."""
-        counts = ((self.n, "state"), (self.m, "input"), (self.p, "output"))
-        return f"<LinearPlant: {', '.join(counted(*each) for each in counts)}, fingerprint {self.fingerprint[:16]}>"
-
-    @property
-    def without_remainder(self) -> LinearPlant:
-        """The same plant without its remainder."""
-        return replace(self, bounds=replace(self.bounds, disturbance=self.bounds.disturbance.declared))
-
-    @property
-    def members(self) -> Any:
-        """The `Family` of which it is the middle; None for a plant that stands for itself."""
-        return None if self.remainder is None else self.remainder.family
+        return f"<LinearPlant: n={self.n}, m={self.m}, p={self.p}, fingerprint {self.fingerprint[:16]}>"
 
     @cached_property
     def is_symmetric(self) -> bool:
@@ -456,11 +446,6 @@ class LinearPlant(LimitValues):
             values = np.maximum(np.maximum(reached.max(axis=0) - high, low - reached.min(axis=0)), values)
         return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values
 
-    @cached_property
-    def fingerprint(self) -> str:
-        """SHA-256 over every number that proofs and simulations take of the plant, the same on every machine."""
-        return self.digest()
-
     def digest(self) -> str:
         """Returns what the fingerprint would be if it were computed now."""
         numbers: list[tuple[Any, Any]] = [(name, getattr(self, _KEPT.get(name, name))) for name in _NUMBERS]
@@ -493,29 +478,23 @@ def row_limit(plant: LinearPlant, j: int) -> str:
     if len(limited) == 1:
         size, unit = row[limited[0]], (plant.input_units + plant.state_units)[limited[0]]
     factors = [(row[i] / size, names[i]) for i in limited]
-    terms = [f"{'-' if each < 0.0 else '+'} {_factor(abs(each))}{name}" for each, name in factors]
+    sizes = ["" if abs(each) == 1.0 else f"{abs(each):.4g} " for each, _ in factors]
+    terms = [f"{'-' if each < 0.0 else '+'} {size}{name}" for (each, name), size in zip(factors, sizes, strict=True)]
     name = " ".join(terms).removeprefix("+ ")
     name = f"-{name[2:]}" if name.startswith("- ") else name
     (low, high), center = sorted((ends[:, j] / size).tolist()), float(row @ center / size)
-    farthest = max((abs(end) for end in (low, high) if abs(end) < np.inf), default=np.inf)
-    center = 0.0 if abs(center) <= _ZERO * farthest else center
+    center = 0.0 if abs(center) <= _ZERO * min(-low, high) else center
     if center == 0.0 and low == -high:
         return f"|{name}| <= {_sized(high, unit)}"
     point = f" (operating point {center:.6g})" if center else ""
     bottom, top = (0.0 if abs(center + end) <= _ZERO * abs(center) else center + end for end in (low, high))
-    if low == -np.inf:
-        return f"{name} <= {_sized(top, unit)}{point}"
-    if high == np.inf:
-        return f"{name} >= {_sized(bottom, unit)}{point}"
-    return f"{bottom:.6g} <= {name} <= {_sized(top, unit)}{point}"
+    left = "" if np.isinf(low - high) else f"{bottom:.6g} <= "
+    right = f">= {_sized(bottom, unit)}" if high == np.inf else f"<= {_sized(top, unit)}"
+    return f"{left}{name} {right}{point}"
 
 
 def _sized(size: float, unit: str) -> str:
     return f"{size:.4g} {unit}".rstrip()
-
-
-def _factor(size: float) -> str:
-    return "" if size == 1.0 else f"{size:.4g} "
 
 
 def of_outputs(H: np.ndarray, of_states: Sequence[str], otherwise: str = "y{}") -> list[str]:

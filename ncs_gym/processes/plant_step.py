@@ -84,7 +84,7 @@ class PlantSimulation:
         self._moved = plant if moves_all or not plant.past else _without_past_inputs(plant)
         self.process = given.opened(self._moved, size)
         self._acting = None if self._moved is plant else acting(plant.model.delays, plant.past)
-        self.plant, self._model = plant if self._is_linear else plant.without_remainder, plant
+        self.plant, self._model = plant if self._is_linear else without_remainder(plant), plant
         self.disturbance, self.size = disturbance, size
         self._truncated, self._is_extreme = noise != "gaussian", noise == "extreme"
         self._allow = allow_assumption_violation
@@ -261,6 +261,11 @@ class PlantSimulation:
     def measure(self, rng: np.random.Generator, state: np.ndarray) -> np.ndarray:
         """Returns y = H x + v, shape (p,) or (p, size)."""
         return self.plant.H.dot(state) + self.sensor_noise.next(rng)
+
+
+def without_remainder(plant: LinearPlant) -> LinearPlant:
+    """Returns the same plant without its remainder."""
+    return replace(plant, bounds=replace(plant.bounds, disturbance=plant.bounds.disturbance.declared))
 
 
 def _without_past_inputs(plant: LinearPlant) -> LinearPlant:

@@ -92,10 +92,10 @@ def unknown_bounds(plant: LinearPlant) -> list[str]:
     """Returns what a plant has of which the paper's theorems know nothing, as a user gave it."""
     other = "another set in Bounds({}=...)".format
     declared = {
-        other("disturbance"): plant.disturbance_bound,
+        other("disturbance"): plant.of_disturbance.bound,
         "a remainder": plant.remainder_bound,
-        other("sensor"): plant.sensor_bound,
-        other("first_error"): plant.initial_bound,
+        other("sensor"): plant.of_sensor.bound,
+        other("first_error"): plant.of_first_error.bound,
     }
     others = [] if plant.is_symmetric else ["limits that are not |c_j x| <= 1 and |u_i| <= u_max_i alone"]
     return others + [name for name, bound in declared.items() if bound is not None and np.any(bound.shape_matrix)]

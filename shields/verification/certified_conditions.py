@@ -82,7 +82,7 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
     ball = scale(Fraction(plant.gamma), rational(np.eye(plant.n)))
     noise = scale(Fraction(plant.process_noise.energy), rational(plant.process_noise.covariance))
     weight = rational(plant.relative_weight)
-    required = _with_declared(_sum_bound(ball, noise, weight), plant.disturbance_bound, weight)
+    required = _with_declared(_sum_bound(ball, noise, weight), plant.of_disturbance.bound, weight)
     required = _with_declared(required, plant.remainder_bound, weight)
     bound, D = rational(plant.disturbance.shape_matrix), certificate.D
     yield matrix_condition("D: the plant's holds the disturbance and the process noise", subtract(bound, required))
@@ -90,7 +90,7 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
     yield matrix_condition("D: the certificate's holds the plant's", subtract(rational(D), bound))
     identity = rational(np.eye(plant.p))
     sensor = scale(Fraction(plant.sensor_noise.energy), rational(plant.sensor_noise.covariance))
-    sensor = _with_declared(sensor, plant.sensor_bound, identity)
+    sensor = _with_declared(sensor, plant.of_sensor.bound, identity)
     if certificate.updates is None:
         yield matrix_condition("N: holds the sensor noise", subtract(rational(plant.sensor_error.shape_matrix), sensor))
     else:
@@ -99,7 +99,7 @@ def _bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[
         difference = subtract(rational(certificate.updates.noise), required)
         yield matrix_condition("N: holds the sensor noise and the quantization error", difference)
     first = scale(Fraction(plant.initial_noise.energy), rational(plant.initial_noise.covariance))
-    first = _with_declared(first, plant.initial_bound, weight)
+    first = _with_declared(first, plant.of_first_error.bound, weight)
     yield matrix_condition(
         "X0: holds the error of the first estimate", subtract(rational(plant.initial_error.shape_matrix), first)
     )

@@ -125,7 +125,10 @@ def reordered(certificate, plant, order):
     square = np.ix_(order, order)
     bounds = {
         name: bound and ncs_gym.Ellipsoid(bound.shape_matrix[np.ix_(*2 * [order[: bound.dim]])])
-        for name, bound in (("disturbance_bound", plant.disturbance_bound), ("initial_bound", plant.initial_bound))
+        for name, bound in (
+            ("disturbance_bound", plant.of_disturbance.bound),
+            ("initial_bound", plant.of_first_error.bound),
+        )
     }
     names = {name: [getattr(plant, name)[i] for i in order] for name in ("state_names", "state_units")}
     turned = altered(

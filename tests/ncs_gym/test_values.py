@@ -41,7 +41,7 @@ def test_past_inputs_are_known_since_delays_and_rates_made_them():
     x, u = np.array([0.1, 0.2, 0.3, 0.4]), np.array([0.5])
     np.testing.assert_allclose(late.A @ x + late.B @ u, [*(A @ x[:2] + B[:, 0] * 0.3), 0.4, 0.5])
     np.testing.assert_allclose(late.mixed_rows @ [*x, *u], [0.1 / 0.3])
-    assert not late.disturbance_bound.shape_matrix[2:].any()
+    assert not late.of_disturbance.bound.shape_matrix[2:].any()
     slow = LinearPlant(MODEL, Limits([1.0, 2.0], 1.0, rate=0.3), BOUNDS)
     assert (slow.n, slow.past) == (3, 1)
     assert LinearPlant(MODEL, Limits([1.0, 2.0], 1.0), BOUNDS).past == 0

@@ -27,6 +27,7 @@ def row_conditions(plant: LinearPlant) -> Iterator[Condition]:
     C, sizes = matrix(plant.box[both]), [number(each) for each in np.abs(plant.box_ends[:, both]).max(axis=0)]
     inverse = (C.transpose() * C).inv() * C.transpose()
     widths = [sum((abs(inverse[i, j]) * size for j, size in enumerate(sizes)), fmpq(0)) for i in range(n)]
+    widths = [width if own is None else min(width, own) for width, own in zip(widths, _own_widths(plant), strict=True)]
     with ctx.workprec(PRECISION):
         needed = _remainders(plant, widths + [number(limit) for limit in plant.largest_input])
         for j, least in enumerate(needed):
@@ -38,6 +39,21 @@ def row_conditions(plant: LinearPlant) -> Iterator[Condition]:
                     yield ball_at_least_zero(name, arb(taken) - least - rho)
                 else:
                     yield is_so(f"end {side} of row {j + 1} is open", kept == given)
+
+
+def _own_widths(plant: LinearPlant) -> list[Any]:
+    """Returns the largest |x_j| that rows of this state alone allow; None where an end of it is open."""
+    widths: list[Any] = []
+    for j in range(plant.n):
+        alone = [
+            (row[j], ends) for row, ends in zip(plant.box, plant.box_ends.T, strict=True) if not np.delete(row, j).any()
+        ]
+        each = [
+            (number(end) / number(c), (end < 0) == (c > 0)) for c, ends in alone for end in ends if np.isfinite(end)
+        ]
+        lows, highs = [value for value, is_low in each if is_low], [value for value, is_low in each if not is_low]
+        widths.append(max(-max(lows), min(highs)) if lows and highs else None)
+    return widths
 
 
 def _remainders(plant: LinearPlant, sizes: list[Any]) -> list[Any]:

@@ -37,14 +37,14 @@ def bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
     weight, quantizer = plant.relative_weight, np.eye(plant.p)
     own = matrix(plant.disturbance.shape_matrix)
     ball = _part(number(plant.gamma) * identity(plant.n), weight)
-    declared = [_declared(bound, weight) for bound in (plant.disturbance_bound, plant.remainder_bound)]
+    declared = [_declared(bound, weight) for bound in (plant.of_disturbance.bound, plant.remainder_bound)]
     disturbed = [ball, _noise(plant.process_noise, weight), *declared]
     yield _holds_sum("D: the plant's holds the disturbance and the process noise", own, disturbed)
     x_c, u_c = (matrix(each).transpose() for each in (certificate.resting_state, certificate.resting_input))
     moved = matrix(plant.A) * x_c + matrix(plant.B) * u_c - x_c  # zero at an equilibrium
     both = [_part(own, weight), _part(moved * moved.transpose(), weight)]
     yield _holds_sum("D: the certificate's holds the plant's", D, both)
-    sensed = [_noise(plant.sensor_noise, quantizer), _declared(plant.sensor_bound, quantizer)]
+    sensed = [_noise(plant.sensor_noise, quantizer), _declared(plant.of_sensor.bound, quantizer)]
     if updates is None:
         yield _holds_sum("N: holds the sensor noise", matrix(plant.sensor_error.shape_matrix), sensed)
     else:
@@ -52,7 +52,7 @@ def bound_conditions(certificate: Certificate, plant: LinearPlant) -> Iterator[C
         box = plant.p * step * step / 4 * identity(plant.p)  # in the ball around the box of |v_i| <= step/2
         sensed.append(_part(box, quantizer))
         yield _holds_sum("N: holds the sensor noise and the quantization error", matrix(updates.noise), sensed)
-    first = [_noise(plant.initial_noise, weight), _declared(plant.initial_bound, weight)]
+    first = [_noise(plant.initial_noise, weight), _declared(plant.of_first_error.bound, weight)]
     yield _holds_sum("X0: holds the error of the first estimate", matrix(plant.initial_error.shape_matrix), first)
     for what, noise in (
         ("process noise", plant.process_noise),

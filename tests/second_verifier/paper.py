@@ -36,7 +36,7 @@ def paper_conditions(certificate: PaperCertificate, plant: LinearPlant) -> Itera
     yield is_so("shapes: L (n, n), K (m, n)", fits)
     if not fits:
         return
-    for bound in (plant.disturbance_bound, plant.remainder_bound, plant.sensor_bound, plant.initial_bound):
+    for bound in (plant.of_disturbance.bound, plant.remainder_bound, plant.of_sensor.bound, plant.of_first_error.bound):
         if bound is not None and np.any(bound.shape_matrix):
             yield is_so("bounds: the paper's theorems know gamma and covariances alone", False)
             return

@@ -269,7 +269,7 @@ def test_two_ended_disturbances_move_each_member():
 
     plant = family_of(pushed, {"k": (0.19, 0.21)}, monotone=True, at_rest=True)
     assert plant.remainder.family.members[..., -1].all()
-    width = np.sqrt(plant.disturbance_bound.shape_matrix.item())
+    width = np.sqrt(plant.of_disturbance.bound.shape_matrix.item())
     assert 0.02 <= width <= 0.02 + 5e-8  # what the members' rest lacks of an equilibrium by rounding is inside
 
 

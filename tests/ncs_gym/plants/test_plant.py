@@ -87,7 +87,7 @@ def test_follower_falls_back_by_what_the_leader_gains():
     plant, v = convoy(), np.array([0.0, 1.0])
     away = expm(np.array([[0.0, -1.0], [0.0, -1.0 / 0.3]]) * 0.1) @ v
     np.testing.assert_allclose(plant.A @ v, away, rtol=1e-12)
-    assert np.sqrt(plant.disturbance_bound.shape_matrix[0, 0]) == pytest.approx(0.45 * 0.1)
+    assert np.sqrt(plant.of_disturbance.bound.shape_matrix[0, 0]) == pytest.approx(0.45 * 0.1)
 
 
 def test_car_moves_sideways_with_its_heading():

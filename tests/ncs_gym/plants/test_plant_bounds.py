@@ -8,6 +8,7 @@ from ncs_gym import Ellipsoid, truck_trailer
 from ncs_gym.disturbances import BY_NAME, as_disturbance
 from ncs_gym.estimation.estimator import Estimator
 from shields.verification.rational_matrix import congruence, is_positive_semidefinite, rational, subtract
+from tests.plants import SOURCES
 from tests.product import altered, linear_plant
 
 BOUNDS = {"disturbance_bound": 0.01, "sensor_bound": 0.02, "initial_bound": 0.03}
@@ -29,8 +30,8 @@ def plain(**changes):
 def test_declared_bound_alone_is_the_set_but_for_rounding(name, kind):
     declared = plain(**{name: KINDS[kind]})
     shape = getattr(declared, SETS[name]).shape_matrix
-    np.testing.assert_allclose(shape, getattr(declared, name).shape_matrix, rtol=1e-8, atol=1e-12)
-    assert np.linalg.eigvalsh(shape - getattr(declared, name).shape_matrix)[0] > -1e-20
+    np.testing.assert_allclose(shape, getattr(declared, SOURCES[name]).bound.shape_matrix, rtol=1e-8, atol=1e-12)
+    assert np.linalg.eigvalsh(shape - getattr(declared, SOURCES[name]).bound.shape_matrix)[0] > -1e-20
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -39,7 +40,7 @@ def test_declared_bound_adds_to_what_covariances_and_gamma_bound(name, kind):
     base = truck_trailer()
     plant = altered(base, **{name: KINDS[kind]})
     for direction in np.random.default_rng(0).standard_normal((200, 2)):
-        need = getattr(base, SETS[name]).support(direction) + getattr(plant, name).support(direction)
+        need = getattr(base, SETS[name]).support(direction) + getattr(plant, SOURCES[name]).bound.support(direction)
         assert getattr(plant, SETS[name]).support(direction) >= need * (1 - 1e-8)
 
 
@@ -56,7 +57,7 @@ def test_every_disturbance_uses_the_declared_bound_and_stays_inside(name, kind, 
     assert plant.allowed_disturbance.gauge(d).max() <= 1.0
     first = as_disturbance(name, plant, False).draw(rng, plant, np.ones(2), 3, source.begin(rng, plant))
     assert first.shape == (2,)
-    axis = plant.disturbance_bound.factor @ np.linalg.svd(plant.disturbance_bound.factor)[2][0]
+    axis = plant.of_disturbance.bound.factor @ np.linalg.svd(plant.of_disturbance.bound.factor)[2][0]
     beyond_gamma = np.abs(d @ axis).max() / np.linalg.norm(axis) - np.sqrt(gamma)
     assert beyond_gamma > 0.4 * np.linalg.norm(axis)
 

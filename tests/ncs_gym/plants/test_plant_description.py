@@ -65,7 +65,7 @@ def test_file_written_by_hand_takes_plain_terms(tmp_path):
     (tmp_path / "plant.json").write_text(json.dumps(content))
     plant = LinearPlant.load(tmp_path / "plant.json")
     np.testing.assert_array_equal(plant.own_limits, [[-np.inf], [2.0]])
-    bounds = plant.disturbance_bound, plant.sensor_bound, plant.initial_bound
+    bounds = plant.of_disturbance.bound, plant.of_sensor.bound, plant.of_first_error.bound
     assert [bound.shape_matrix[0, 0] ** 0.5 for bound in bounds] == pytest.approx([0.01, 0.02, 0.03])
 
 

@@ -10,6 +10,7 @@ from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from ncs_gym import Channel, Ellipsoid, FunctionProcess, GymProcess
 from ncs_gym.plants.family import Remainder
+from ncs_gym.processes.plant_step import without_remainder
 from ncs_gym.processes.process import LinearProcess, Process
 from tests.product import gym_env, gym_vector_env, linear_plant, loop_env, vector_env
 
@@ -174,7 +175,7 @@ def test_remainder_is_left_to_the_process():
     left_out = Remainder(Ellipsoid(0.01 * np.eye(2)), True, "an example")
     whole = plant(disturbance_bound=0.0, remainder=left_out)
     np.testing.assert_allclose(whole.disturbance.shape_matrix, 0.01 * np.eye(2), rtol=1e-6)
-    assert whole.without_remainder.fingerprint == plant(disturbance_bound=0.0).fingerprint != whole.fingerprint
+    assert without_remainder(whole).fingerprint == plant(disturbance_bound=0.0).fingerprint != whole.fingerprint
     for process, moves in ((LinearProcess(), True), (FunctionProcess(linear), False)):
         env = loop_env(whole, process=process, disturbance="sphere")
         _, info = env.reset(seed=0)

@@ -12,6 +12,7 @@ import ncs_gym
 from ncs_gym.processes.cart_pole_process import CartPoleProcess, nonlinear_cart_pole, sampled_cart_pole
 from ncs_gym.processes.gym_pendulum import PendulumProcess
 from ncs_gym.processes.mujoco_pendulum import InvertedPendulumProcess, inverted_pendulum, sampled_inverted_pendulum
+from ncs_gym.processes.plant_step import without_remainder
 from ncs_gym.registration import needing_extras, registered_ids
 
 IDS = ("ncs_gym/Pendulum-v0", "ncs_gym/CartPoleNonlinear-v0", "ncs_gym/InvertedPendulum-v0")
@@ -55,7 +56,7 @@ def test_vectors_move_like_single_environments(env_id):
     for e in range(3):
         env.reset(seed=0, options={"state": info["state"][e]})
         *_, single = env.step(action[e])
-        room = np.sqrt(np.diag(plant.without_remainder.disturbance.shape_matrix))  # of two disturbances
+        room = np.sqrt(np.diag(without_remainder(plant).disturbance.shape_matrix))  # of two disturbances
         assert (np.abs(single["state"] - after["state"][e]) <= 2.0 * room).all()
     many.close()
 
@@ -84,8 +85,8 @@ def test_declared_model_is_the_one_that_sampling_finds(declared, sampled, needs)
     np.testing.assert_allclose(
         plant.remainder.bound.shape_matrix / units, again.remainder.bound.shape_matrix / units, atol=1e-3
     )
-    for name in ("sensor_bound", "initial_bound", "disturbance_bound"):
-        np.testing.assert_array_equal(getattr(plant, name).shape_matrix, getattr(again, name).shape_matrix)
+    for name in ("of_sensor", "of_first_error", "of_disturbance"):
+        np.testing.assert_array_equal(getattr(plant, name).bound.shape_matrix, getattr(again, name).bound.shape_matrix)
 
 
 @pytest.mark.parametrize(

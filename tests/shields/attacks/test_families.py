@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from experiments.commands.attack import hostile_agents, starts, worst_case
 from ncs_gym import Channel, ChannelContract, Ellipsoid, FunctionProcess, Packet
 from ncs_gym.plants.family import Remainder
+from ncs_gym.processes.plant_step import without_remainder
 from ncs_gym.registration import CART_POLE_CHANNEL, CASE_STUDY_CHANNEL
 from tests.certificates import certificate_of
 from tests.plants import varying_cart_pole, varying_truck
@@ -54,7 +55,7 @@ def attacked(name, plant, certificate, count, steps, mode="project", seed=0, pro
     fixed = {"parameters": {each: chosen[:, k] for k, each in enumerate(family.names)}}
     begun = {"state": starts(certificate, rng, count)}
     _, info = shield.reset(seed=seed, options=begun if process else begun | fixed)
-    act, declared = hostile_agents(certificate, plant, count, rng), plant.without_remainder.disturbance
+    act, declared = hostile_agents(certificate, plant, count, rng), without_remainder(plant).disturbance
     m, n = plant.m, plant.n
     truth = [expm(plant.dt * np.vstack([derivatives(name, each), np.zeros((m, n + m))]))[:n] for each in chosen]
     held = outside = left = unsafe = alarms = 0
@@ -94,6 +95,7 @@ def test_certificate_of_the_middle_alone_does_not_hold_and_that_is_seen(name):
     nothing = Remainder(Ellipsoid(np.zeros((family.n, family.n))), True, "nothing", family.remainder.family)
     bare = altered(family)
     object.__setattr__(bare, "remainder", nothing)  # nobody can make such a plant
+    object.__setattr__(bare, "fingerprint", bare.digest())
     counts = attacked(name, bare, certified(name, bare), 24, 120)
     assert counts["alarms"] > 1000
     assert counts["outside"] == 0  # for an alarm ends the guarantee

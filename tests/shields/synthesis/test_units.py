@@ -7,7 +7,7 @@ import pytest
 
 from ncs_gym import ChannelContract, Ellipsoid, LinearPlant
 from shields import Infeasible, verify
-from tests.plants import servo, small
+from tests.plants import SOURCES, servo, small
 from tests.product import linear_plant, synthesize
 from tests.shields.polytope.limits import TANKS
 
@@ -29,7 +29,7 @@ def in_units(plant: LinearPlant, state: np.ndarray, applied: np.ndarray, output:
     bounds = {
         name: Ellipsoid(bound.shape_matrix * np.outer(unit, unit))
         for name, unit in units.items()
-        if (bound := getattr(plant, name)) is not None
+        if (bound := getattr(plant, SOURCES[name]).bound) is not None
     }
     return linear_plant(
         A=plant.A * state[:, None] / state,

@@ -69,7 +69,7 @@ def test_first_error_that_misses_a_bound_declared_beside_a_covariance_makes_a_ce
     plant = library_plant(truck_trailer, 4000.0, initial_cov=np.diag([1e-4, 0.0]), initial_bound=([[1.0], [0.3]], 0.02))
     certificate = certificate_of(plant)
     assert verified(certificate, plant).valid
-    larger = replaced(plant, initial_bound=Ellipsoid(1.001 * plant.initial_bound.shape_matrix))
+    larger = replaced(plant, initial_bound=Ellipsoid(1.001 * plant.of_first_error.bound.shape_matrix))
     assert [name[:3] for name in broken(certificate, larger)] == ["X0:"]
 
 
