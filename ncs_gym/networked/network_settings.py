@@ -106,8 +106,14 @@ def zero_of(space: spaces.Space) -> Any:
     return zero
 
 
+# Types of which nobody can change a value.
+_UNCHANGING = {int, float, bool, str, type(None), np.int64, np.float64, np.float32, np.bool_}
+
+
 def snapshot(sample: Any) -> Any:
     """Returns a sample or an action that stays as it is, whatever environment or agent write into their own later."""
+    if type(sample) in _UNCHANGING:
+        return sample
     if isinstance(sample, np.ndarray):
         return sample.copy(order="K")
     if isinstance(sample, dict):
@@ -142,6 +148,13 @@ class Entries:
         if any(name not in ENTRIES for name in several) or len(set(several)) < len(several):
             raise ValueError(f"observe must list, each at most once, some of {', '.join(ENTRIES)}, got {shown(names)}")
         self.names, self._inner, self._actions = several, observations, actions
+        # Of a one-hot vector, which number of an action each entry is about, and the choice that it stands for.
+        self._choices = np.empty(0, int), np.empty(0, int)
+        if isinstance(actions, spaces.Discrete | spaces.MultiDiscrete):
+            counts = np.ravel(actions.n if isinstance(actions, spaces.Discrete) else actions.nvec)
+            starts, each = np.ravel(actions.start).tolist(), counts.tolist()
+            values = [np.arange(first, first + n) for first, n in zip(starts, each, strict=True)]
+            self._choices = np.repeat(np.arange(len(counts)), counts), np.concatenate(values)
         made = {
             "age": lambda: spaces.Box(0.0, OLDEST_OBSERVED, (parts,), np.float32),
             "arrived": lambda: spaces.Box(0, 1, (parts,), np.int8),
@@ -182,15 +195,17 @@ class Entries:
         """
         if not self.names:
             return observation
-        values = {
-            "age": lambda: np.minimum(age, OLDEST_OBSERVED).astype(np.float32),
-            "arrived": lambda: np.asarray(arrived, np.int8),
-            "pending_actions": lambda: self._told(np.array(pending)),  # the network writes on into its own
-        }
-        added = {name: values[name]() for name in self.names}
+        added = {}
+        for name in self.names:
+            if name == "age":
+                added[name] = np.minimum(age, OLDEST_OBSERVED).astype(np.float32)
+            elif name == "arrived":
+                added[name] = np.asarray(arrived, np.int8)
+            else:
+                added[name] = self._told(np.array(pending))  # the network writes on into its own
         if self._is_flat:
-            lead = np.shape(observation)[:-1]
-            flat = [each.reshape(*lead, -1) for each in added.values()]
+            shape = (*observation.shape[:-1], -1)
+            flat = [each.reshape(shape) for each in added.values()]
             return np.concatenate([observation, *flat], axis=-1, dtype=self.space.dtype, casting="unsafe")  # type: ignore[call-overload]
         if isinstance(self._inner, spaces.Tuple):
             return (*observation, *added.values())
@@ -205,10 +220,9 @@ class Entries:
         entries = actions.reshape(*actions.shape[: actions.ndim - len(space.shape or ())], -1)
         if isinstance(space, spaces.MultiBinary):
             return entries.astype(np.int8)
-        counts = space.n if isinstance(space, spaces.Discrete) else space.nvec  # type: ignore[union-attr]
-        numbers = entries - np.ravel(space.start)  # type: ignore[union-attr]
-        one_hot = [np.arange(n) == numbers[..., k, None] for k, n in enumerate(np.ravel(counts).tolist())]
-        return np.concatenate(one_hot, axis=-1, dtype=np.int8)
+        columns, values = self._choices
+        numbers = entries if entries.shape[-1] == 1 else entries[..., columns]
+        return (numbers == values).view(np.int8)
 
 
 def pending_space(actions: spaces.Space, pending: int) -> spaces.Box:
@@ -226,6 +240,7 @@ INFOS = (
     *("measurement_age", "packet_arrived", "action_age", "action_applied", "packets"),
     *("channel_loss", "channel_delay", "downlink_loss", "downlink_delay"),
 )
+_INFOS = frozenset(INFOS)
 IDLE = "hold", "neutral"
 # Keeps what the network draws apart from what an environment of the same seed draws.
 NETWORK_STREAM = 0x6E6574
@@ -446,10 +461,11 @@ def require_no_restarts(env: Any) -> None:
 
 def require_no_network(info: Mapping[str, Any]) -> None:
     """Raises ValueError if infos of the environment have keys that are those of the network."""
-    if taken := [key for key in INFOS if key in info]:
+    if not _INFOS.isdisjoint(info):
+        taken = next(key for key in INFOS if key in info)
         raise ValueError(
-            f"infos of the environment inside have the key {taken[0]!r}, which is the network's: call it otherwise, or "
-            "if another network put it there, have one network with all delays and losses"
+            f"infos of the environment inside have the key {taken!r}, which is the network's: call it otherwise, or if "
+            "another network put it there, have one network with all delays and losses"
         )
 
 

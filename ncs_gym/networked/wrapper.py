@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -194,10 +193,9 @@ class Networked(ReadNetwork, gym.Wrapper):
         observation = joined(settings.parts, seen)
         if not settings.entries.names:
             return observation
-        ages = np.array([step - arrivals.stamp for arrivals in self._arrivals])
-        arrived = np.array([arrivals.arrived for arrivals in self._arrivals])
-        pending = np.array(self._decided) if self._observes_actions else None
-        return settings.entries.added_to(observation, ages, arrived, pending)
+        ages = [step - arrivals.stamp for arrivals in self._arrivals]
+        arrived = [arrivals.arrived for arrivals in self._arrivals]
+        return settings.entries.added_to(observation, ages, arrived, self._decided)
 
     def _with_network(self, info: dict[str, Any], applied: Any, action_age: int) -> dict[str, Any]:
         require_no_network(info)
@@ -209,7 +207,7 @@ class Networked(ReadNetwork, gym.Wrapper):
             "action_age": action_age,
             "action_applied": snapshot(applied),
             "packets": self._packets,
-            **deepcopy(self._network),
+            **(self._network if self._settings.keys is None else snapshot(self._network)),
         }
 
 
@@ -447,7 +445,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper):
             "action_age": self._action_age.copy(),
             "action_applied": self._applied.copy(),
             "packets": self._packets.copy(),
-            **deepcopy(self._network),
+            **snapshot(self._network),
         }
 
 
