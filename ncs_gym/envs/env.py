@@ -224,12 +224,11 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
         start, now = start_option(options, self.plant), self._now
         sources, fixed = now.read(options)
         super().reset(seed=seed)
-        sources = now.drawn(sources, self.np_random)
+        chosen = now.choose(sources, self.np_random)
         self._consistent = False
         if seed is not None:
             now.process.forget()
-        now.give(sources)
-        now.begin(self.np_random, start, fixed)
+        now.begin(self.np_random, start, fixed, chosen)
         self._begin_draws_of_task(seed)
         self._task_state = self._task.begin(self._task_random, self.plant)
         guard = self._guard

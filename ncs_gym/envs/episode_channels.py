@@ -32,7 +32,7 @@ class EpisodeChannels:
 
     Attributes:
         now: Those of the present episodes.
-        is_plain: Whether all have the declared one, and will have it in the next episode, too.
+        is_plain: Whether all have the declared one.
     """
 
     def __init__(self, declared: Channel | None, require_fitting: Callable[[Channel], None], count: int = 1) -> None:
@@ -40,16 +40,15 @@ class EpisodeChannels:
         if declared is not None:
             require_fitting(declared)
         self._own: Channel | Draw | None = declared
-        self._sources: list[Any] = [None] * count
         self.now: list[Any] = [declared] * count
         self.is_plain = True
 
     def draw_from(self, draw: Draw | None) -> None:
         """Has all episodes that begin from now on draw their channels; None for the declared one again."""
-        self._own, self.is_plain = draw or self._declared, False
+        self._own = draw or self._declared
 
-    def read(self, option: Any, name: str) -> list[Any]:
-        """Returns the sources that an option of `reset` names, one for each environment; they are for one episode.
+    def read(self, option: Any, name: str) -> list[Any] | None:
+        """Returns the sources that an option of `reset` names, one for each environment; None without the option.
 
         Args:
             option: A source for all, or N of them; a channel also as a dictionary of its fields.
@@ -58,8 +57,10 @@ class EpisodeChannels:
         Raises:
             ValueError: If it is none of these, or a channel that the environments cannot have.
         """
+        if option is None:
+            return None
         count, option = len(self.now), from_json(option, (Channel,), name)
-        each = [option] * count if option is None or isinstance(option, Channel) or callable(option) else option
+        each = [option] * count if isinstance(option, Channel) or callable(option) else option
         each = [from_json(one, (Channel,), name) for one in each] if isinstance(each, (list, tuple)) else each
         if not isinstance(each, list) or len(each) != count:
             several = "" if count == 1 else f", or a list of {count} of these"
@@ -69,46 +70,38 @@ class EpisodeChannels:
                 self._checked(source, name)
         return each
 
-    def drawn(self, sources: list[Any], rng: np.random.Generator, rows: Sequence[int] | None = None) -> list[Any]:
-        """Returns sources in which those that draw have drawn for the next episodes of some environments.
+    def choose(self, sources: list[Any] | None, rng: np.random.Generator, rows: Sequence[int]) -> dict[int, Any]:
+        """Returns the channels of the next episodes of some environments, by their indices; nothing has changed then.
 
         Args:
-            sources: What `read` returned.
-            rng: Draws.
-            rows: Indices of these environments; all by default.
-
-        Raises:
-            ValueError: If what was drawn is no channel that the environments can have; nothing has changed then.
-        """
-        found = list(sources)
-        if callable(self._own) or any(map(callable, sources)):
-            for e in range(len(found)) if rows is None else rows:
-                found[e] = self._channel(found[e], rng)
-        return found
-
-    def give(self, sources: list[Any], chosen: Sequence[int] | None = None) -> None:
-        """Takes sources for the next episodes of some environments, given by their indices; of all by default."""
-        if chosen is None or len(chosen) == len(self.now):
-            self._sources, self.now = list(sources), [self._declared] * len(self.now)
-            self.is_plain = sources == [None] * len(sources)
-        elif not self.is_plain or any(sources[e] is not None for e in chosen):
-            self.is_plain = False
-            for e in chosen:
-                self._sources[e] = sources[e]
-
-    def begin(self, rng: np.random.Generator, rows: np.ndarray | None = None) -> list[Any] | None:
-        """Draws the channels of episodes that begin in some environments, given by their indices; in all by default.
+            sources: What `read` returned; None for the environments' own.
+            rng: Draws those that are drawn.
+            rows: Indices of these environments.
 
         Returns:
-            Those of all environments; None if all have the declared one, as before.
+            None of them where all have the declared one, as before.
 
         Raises:
             ValueError: If what was drawn is no channel that the environments can have.
         """
-        if self.is_plain:
+        if sources is None and self.is_plain and self._own is self._declared:
+            return {}
+        chosen = {}
+        for e in rows:
+            source = self._own if sources is None or sources[e] is None else sources[e]
+            if callable(source):
+                drawn = from_json(source(rng), (Channel,), "what was drawn")
+                source = self._checked(drawn, "what was drawn")
+            chosen[e] = source
+        return chosen
+
+    def begin(self, chosen: dict[int, Any]) -> list[Any] | None:
+        """Takes what `choose` returned; returns the channels of all environments, None if they are as before."""
+        if not chosen:
             return None
-        for e in range(len(self.now)) if rows is None else rows.tolist():
-            self.now[e], self._sources[e] = self._channel(self._sources[e], rng), None
+        for e, channel in chosen.items():
+            self.now[e] = channel
+        self.is_plain = all(each is self._declared for each in self.now)
         return self.now
 
     def infos(self, name: str, *, many: bool) -> dict[str, Any]:
@@ -123,12 +116,6 @@ class EpisodeChannels:
         if not many:
             return {f"{name}_loss": losses[0], f"{name}_delay": delays[0]}
         return {f"{name}_loss": np.array(losses), f"{name}_delay": np.array(delays)}
-
-    def _channel(self, source: Any, rng: np.random.Generator) -> Any:
-        source = self._own if source is None else source
-        if not callable(source):
-            return source
-        return self._checked(from_json(source(rng), (Channel,), "what was drawn"), "what was drawn")
 
     def _checked(self, channel: Any, name: str) -> Channel:
         if not isinstance(channel, Channel):

@@ -156,14 +156,9 @@ class LoopState(CopiedWhole, ABC):
         sources = [links.read(given.get(name), name) for (name, _), links in self.links.items()]
         return sources, self.process.read_parameters(given.get("parameters"))
 
-    def drawn(self, sources: list[Any], rng: np.random.Generator, chosen: list[int] | None = None) -> list[Any]:
-        """Returns sources in which those that draw have drawn; nothing has changed where that fails."""
-        return [links.drawn(each, rng, chosen) for links, each in zip(self.links.values(), sources, strict=True)]
-
-    def give(self, sources: list[Any], chosen: list[int] | None = None) -> None:
-        """Gives the next episodes of some loops, all by default, the channels of sources."""
-        for links, each in zip(self.links.values(), sources, strict=True):
-            links.give(each, chosen)
+    def choose(self, sources: list[Any], rng: np.random.Generator, rows: Sequence[int] = (0,)) -> list[dict[int, Any]]:
+        """Returns the channels of the next episodes of some loops, up and down; nothing has changed then."""
+        return [links.choose(each, rng, rows) for links, each in zip(self.links.values(), sources, strict=True)]
 
     def _channel_infos(self) -> dict[str, Any]:
         many = self._size is not None
@@ -295,16 +290,22 @@ class OneLoop(LoopState):
         self.start = loop.initial_set
         self.received: list[Any] = []
 
-    def begin(self, rng: np.random.Generator, start: np.ndarray | None, fixed: np.ndarray | None) -> None:
-        """Begins an episode at a state, (n,), or a drawn one; `fixed` is what `read` returned of parameters."""
+    def begin(
+        self,
+        rng: np.random.Generator,
+        start: np.ndarray | None,
+        fixed: np.ndarray | None,
+        chosen: list[dict[int, Any]],
+    ) -> None:
+        """Begins an episode at a state, (n,), or a drawn one; for the others see `read` and `choose`."""
         loop, self.moves = self.loop, self.moves + 1
         self.inputs, self.arrived = self._no_inputs, self._no_inputs.missing
         initial = loop.initial_set if start is None else None
         first = (1.0 - SAMPLE_ROUNDING) * loop.initial_set.sample(rng) if start is None else start
         self.state, self.start = self.process.start(rng, first, initial, fixed)
         self.memory = self.process.begin(rng)
-        for links in self.links.values():
-            links.begin(rng)
+        self.channels.begin(chosen[0])
+        self.downlinks.begin(chosen[1])
         self._others = self._channel_infos()
         channel = self.channels.now[0]
         self.network, self.packets = ChannelState(channel, rng), 0
@@ -344,9 +345,14 @@ class ManyLoops(LoopState):
         self.worst = plant.values_at_start(self.state)
 
     def begin(
-        self, rng: np.random.Generator, mask: np.ndarray, starts: np.ndarray | None, fixed: np.ndarray | None
+        self,
+        rng: np.random.Generator,
+        mask: np.ndarray,
+        starts: np.ndarray | None,
+        fixed: np.ndarray | None,
+        chosen: list[dict[int, Any]] | None = None,
     ) -> None:
-        """Begins episodes where a mask, (N,), says so, at states, (N, n), or drawn ones; for `fixed` see `read`."""
+        """Begins episodes where a mask, (N,), says so, at states, (N, n), or drawn ones, else as one loop does."""
         loop, rows, self.moves = self.loop, np.flatnonzero(mask), self.moves + mask
         self.inputs, self.arrived = self._no_inputs, self._no_inputs.missing
         count = len(rows)
@@ -355,8 +361,9 @@ class ManyLoops(LoopState):
         initial, states = (loop.initial_set, first_states) if starts is None else (None, starts[mask].T)
         states, known = self.process.start_many(rng, states, initial, mask, fixed)
         memory = self.process.begin(rng, count)
-        channels, commands = self.channels.begin(rng, rows), self.downlinks.begin(rng, rows)
-        if count == self.size or not (self.channels.is_plain and self.downlinks.is_plain):
+        up, down = self.choose([None, None], rng, rows.tolist()) if chosen is None else chosen
+        channels, commands = self.channels.begin(up), self.downlinks.begin(down)
+        if count == self.size or channels or commands:
             self._others = self._channel_infos()
         if count == self.size:
             self.memory = np.array(memory)
@@ -364,7 +371,7 @@ class ManyLoops(LoopState):
         else:
             self.memory = with_columns(self.memory, mask, memory)
             self.network.begin(rng, rows, channels)
-        self._prepare_estimator(all_begin=count == self.size)
+        self._prepare_estimator(channels or [loop.channel], all_begin=count == self.size)
         self.state = with_columns(self.state, mask, states)
         self.estimator.begin(mask, states + first_errors)
         self.downlink.begin(rng, mask, commands)
@@ -375,11 +382,11 @@ class ManyLoops(LoopState):
         self.worst = np.where(mask, loop.plant.values_at_start(self.state), self.worst)
         self.start[mask] = known
 
-    def _prepare_estimator(self, *, all_begin: bool) -> None:
-        """Makes the estimator one for the delays of all present channels; it forgets nothing unless all begin."""
-        known, declared = self.estimator.histories.channel, self.loop.channel
-        used = [declared] if self.channels.is_plain else [*self.channels.now, *([] if all_begin else [known])]
-        if (wanted := covering(used, declared)) != known:
+    def _prepare_estimator(self, used: Sequence[Channel], *, all_begin: bool) -> None:
+        """Makes the estimator one for the delays of these channels; it forgets nothing unless all begin."""
+        known = self.estimator.histories.channel
+        used = [*used, *([] if all_begin else [known])]
+        if (wanted := covering(used, self.loop.channel)) != known:
             histories = self.loop.histories(wanted)
             if all_begin:
                 self.estimator = VectorEstimator(self.loop.plant, histories, self.size)

@@ -125,13 +125,11 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
         if seed is not None:
             self._now.process.forget()
         self._begin_draws_of_task(seed)
-        chosen = np.flatnonzero(mask).tolist()
-        sources = self._now.drawn(sources, self.np_random, chosen)
+        chosen = self._now.choose(sources, self.np_random, np.flatnonzero(mask).tolist())
         if not (self._consistent or mask.all()):
             raise gym.error.ResetNeeded("reset all environments first")
         self._consistent = False
-        self._now.give(sources, chosen)
-        observation, info = self._begin(mask, starts, fixed)
+        observation, info = self._begin(mask, starts, fixed, chosen)
         self._autoreset.over = self._autoreset.over & ~mask
         self._consistent = True
         if self._guard is not None:
@@ -180,10 +178,10 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
             truncated |= self.steps >= self._max_episode_steps
         return self._observation(), reward, terminated, truncated, info
 
-    def _begin(self, mask: np.ndarray, starts: np.ndarray | None = None, fixed: np.ndarray | None = None) -> Begun:
+    def _begin(self, mask: np.ndarray, starts: Any = None, fixed: Any = None, chosen: Any = None) -> Begun:
         """Begins episodes; see `ManyLoops.begin`."""
         now = self._now
-        now.begin(self.np_random, mask, starts, fixed)
+        now.begin(self.np_random, mask, starts, fixed, chosen)
         begun = self._task.begin_many(self._task_random, self.plant, int(np.count_nonzero(mask)))
         self._task_state = np.array(begun) if mask.all() else with_columns(self._task_state, mask, begun)
         self._belief, info = now.report(counted=mask)

@@ -326,7 +326,7 @@ class NetworkSettings:
 
     def sources(
         self, options: dict[str, Any], links: dict[tuple[str, Any], EpisodeChannels]
-    ) -> list[tuple[EpisodeChannels, list[Any]]]:
+    ) -> list[tuple[EpisodeChannels, list[Any] | None]]:
         """Returns the channels with what the options "channel" and "downlink" make of each, and takes the options out.
 
         Raises:

@@ -129,12 +129,11 @@ class Networked(ReadNetwork, gym.Wrapper):
         if seed is not None:
             self._rng = network_rng(seed)
         rng = self.np_random
-        drawn = [(links, links.drawn(each, rng)) for links, each in sources]
+        chosen = [(links, links.choose(each, rng, [0])) for links, each in sources]
         observation, info = self.env.reset(seed=seed, options=own or None)
         require_no_network(info)  # before anything changes
-        for links, given in drawn:
-            links.give(given)
-            links.begin(rng)
+        for links, channels in chosen:
+            links.begin(channels)
         self._network = self._settings.infos(self._links)
         self._step = self._packets = 0
         sample = snapshot(observation)
@@ -323,33 +322,31 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper):
         if first is None and seed is not None:
             raise ValueError(f"the first of the seeds seeds the networks, and must be a number, got {shown(seed)}")
         own, count = dict(options or {}), self.num_envs
-        chosen = np.asarray(own.get("reset_mask", np.ones(count, np.bool_)))
-        own |= {"reset_mask": chosen} if "reset_mask" in own else {}
+        mask = np.asarray(own.get("reset_mask", np.ones(count, np.bool_)))
+        own |= {"reset_mask": mask} if "reset_mask" in own else {}
         if not self._started:
-            chosen = np.ones(count, np.bool_)
-        sources, rows = self._settings.sources(own, self._links), np.flatnonzero(chosen)
+            mask = np.ones(count, np.bool_)
+        sources, rows = self._settings.sources(own, self._links), np.flatnonzero(mask)
         if first is not None:
             self._rng = network_rng(first)
-        drawn = [(links, links.drawn(each, self.np_random, rows.tolist())) for links, each in sources]
+        chosen = [links.choose(each, self.np_random, rows.tolist()) for links, each in sources]
         observations, info = self.env.reset(seed=seed, options=own or None)  # pyright: ignore[reportArgumentType]
         require_batched_infos(info, "VectorNetworked")
         require_no_network(info)
-        for links, each in drawn:
-            links.give(each, rows.tolist())
-        everywhere = bool(chosen.all())
-        if not everywhere:
-            self._over = self._over & ~chosen  # what is reset now begins no episode in the next step
+        if mask.all():
+            self._make(chosen)
+            self._begin(rows, observations)
         else:
-            self._make()
-        self._begin(rows, observations, anew=not everywhere)
+            self._over = self._over & ~mask  # what is reset now begins no episode in the next step
+            self._begin_anew(rows, observations, chosen)
         return self._seen(), self._with_network(info)
 
-    def _make(self) -> None:
-        """Makes the memory of all networks, for episodes that begin in all environments."""
+    def _make(self, chosen: list[dict[int, Any]]) -> None:
+        """Makes the memory of all networks, for episodes that begin in all environments over the channels chosen."""
         rng, settings, count = self.np_random, self._settings, self.num_envs
         self._started = True
-        self._uplinks.begin(rng)
-        self._downlinks.begin(rng)
+        self._uplinks.begin(chosen[0])
+        self._downlinks.begin(chosen[1])
         self._samples = _ManyArrivals(VectorChannelState(self._uplinks.now, rng, count), count, 0)
         self._commands = None
         if settings.downlink is not None:
@@ -361,21 +358,21 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper):
         self._steps, self._packets = np.zeros(count, np.int64), np.zeros(count, np.int64)
         self._over = np.zeros(count, np.bool_)
 
-    def _begin(self, rows: np.ndarray, observations: np.ndarray, *, anew: bool = False) -> None:
-        """Starts episodes in some environments, with their first observations.
+    def _begin_anew(self, rows: np.ndarray, observations: np.ndarray, chosen: Any = None) -> None:
+        """Starts episodes where others ran before, whose packets are on their way; see `_begin` and `_make`."""
+        rng, links = self.np_random, self._links.values()
+        chosen = [each.choose(None, rng, rows.tolist()) for each in links] if chosen is None else chosen
+        up, down = (each.begin(own) for each, own in zip(links, chosen, strict=True))
+        self._samples.link.begin(rng, rows, up)
+        if self._commands is not None:
+            self._commands.link.begin(rng, rows, down)
+        if up or down:
+            self._network = self._settings.infos(self._links, many=True)
+        self._begin(rows, observations)
 
-        Args:
-            rows: Indices of the environments.
-            observations: Of all environments.
-            anew: Whether other episodes ran before, whose packets are on their way.
-        """
-        rng, commands = self.np_random, self._commands
-        if anew:
-            self._samples.link.begin(rng, rows, self._uplinks.begin(rng, rows))
-            if commands is not None:
-                commands.link.begin(rng, rows, self._downlinks.begin(rng, rows))
-            if not (self._uplinks.is_plain and self._downlinks.is_plain):
-                self._network = self._settings.infos(self._links, many=True)
+    def _begin(self, rows: np.ndarray, observations: np.ndarray) -> None:
+        """Starts episodes in some environments, given by their indices, with the first observations of all."""
+        commands = self._commands
         self._samples.begin(rows, np.array(observations))
         if commands is not None:
             commands.begin(rows, np.repeat(np.asarray(self._settings.neutral)[None], self.num_envs, axis=0))
@@ -410,13 +407,13 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper):
             sample[e] = info["final_obs"][e]
         self._packets += self._samples.exchange(rng, self._steps, sample, self._settings.parts[0].space)
         if len(rows := restarted.nonzero()[0]):
-            self._begin(rows, sample, anew=True)
+            self._begin_anew(rows, sample)
         if ends_now:
             ended = info.get("final_info")
             final = self._with_network(ended if isinstance(ended, dict) else {})
             info = info | {"final_obs": self._seen(), "final_info": final}
             info.setdefault("_final_info", done)
-            self._begin(np.flatnonzero(done), observations, anew=True)
+            self._begin_anew(np.flatnonzero(done), observations)
         self._over = done
         return self._seen(), rewards, terminated, truncated, self._with_network(info)
 
