@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import inspect
 import os
 import re
 import shutil
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from types import FrameType
+from types import CodeType, FrameType
 from typing import Any
 
 import gymnasium as gym
@@ -38,9 +39,10 @@ def complexity() -> None:
 
     Lines of the product, of benchmarks, examples and tests, and of templates and data (those of the report, tuned
     hyperparameters, JSON of the packages but for certificates and trained agents); branches that ask whether a feature
-    is there at all (`x is None` of a contract, a polytope, a remainder, a plan, a downlink, ages); and calls of
-    functions of the product in one step of an environment, as it comes and behind a shield whose action passes, and how
-    often the module changes from one to the next.
+    is there at all (`x is None` of a contract, a polytope, a remainder, a plan, a downlink, ages); which functions of
+    the product make an environment, its shield, and its first 200 steps behind it, in a process that has made nothing
+    yet; and their calls in one step, as it comes and behind a shield whose action passes, and how often the module
+    changes from one to the next.
     """
     product = sources(*PACKAGES)
     nodes = [node for path in product for node in ast.walk(ast.parse(path.read_text()))]
@@ -49,6 +51,18 @@ def complexity() -> None:
     print(f"{', '.join(others)}, {lines(templates_and_data()):,} of templates and data")
     print(f"{sum(map(asks_for_feature, nodes))} branches ask whether a feature is there")
     case = "ncs_gym/TruckTrailerCruise-v0"
+    made: list[Any] = []
+    parts: dict[str, Callable[[], Any]] = {
+        "gym.make": lambda: made.append(gym.make(case)),
+        "the shield": lambda: made.append(SafetyShield(made[-1])),
+        "the first reset": lambda: made[-1].reset(seed=0),
+        "200 shielded steps": lambda: [made[-1].step(made[-1].action_space.sample()) for _ in range(200)],
+    }
+    for name, part in parts.items():
+        functions = functions_of(part)
+        total = sum(map(len_of, functions))
+        modules = len({code.co_filename for code in functions})
+        print(f"{name}: {len(functions)} functions of {total:,} lines in {modules} modules")
     for name, env in {"a step": gym.make(case), "a shielded step": SafetyShield(gym.make(case))}.items():
         step = step_of(env)
         calls, changes = sorted(walked(step) for _ in range(25))[12]  # the median
@@ -102,6 +116,28 @@ def walked(run: Callable[[], Any]) -> tuple[int, int]:
     finally:
         sys.setprofile(None)
     return len(modules), sum(one != other for one, other in pairwise(modules))
+
+
+def functions_of(run: Callable[[], Any]) -> set[CodeType]:
+    """Returns the functions of the product that a call runs through, without comprehensions and lambdas."""
+    found: set[CodeType] = set()
+
+    def note(frame: FrameType, event: str, _: Any) -> None:
+        package = frame.f_globals.get("__name__", "").partition(".")[0]
+        if event == "call" and package in PACKAGES and frame.f_code.co_name[0] != "<":
+            found.add(frame.f_code)
+
+    sys.setprofile(note)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return found
+
+
+def len_of(function: CodeType) -> int:
+    """Returns how many lines a function has in its file, 0 if it has none."""
+    return len(inspect.getsource(function).splitlines()) if Path(function.co_filename).exists() else 0
 
 
 def step_of(env: gym.Env[Any, Any]) -> Callable[[], Any]:
