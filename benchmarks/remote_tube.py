@@ -59,7 +59,8 @@ def shield_at_plant(plant: LinearPlant, certificate: Certificate, *, local: bool
             z = plant.A @ z + plant.B @ plan[-1]
         newest = np.array(plan) if down else newest[1:]
         proposed = gain @ (x - REFERENCE) if local else newest[0] if len(newest) else None
-        u = loop.step(proposed, [Packet(step, x, loop.episode)]).input
+        loop.receive([Packet(step, x, loop.episode)])
+        u = loop.decide(proposed).input
         x_hat = plant.A @ x + plant.B @ u if up else plant.A @ x_hat + plant.B @ plan[0]
         return u
 

@@ -215,7 +215,8 @@ def memory(steps: int = 100_000) -> None:
     loop.start(x)
     first = resident()
     for step in range(steps):
-        u = loop.step(rng.uniform(-1.0, 1.0, 1) * plant.largest_input, packets).input
+        loop.receive(packets)
+        u = loop.decide(rng.uniform(-1.0, 1.0, 1) * plant.largest_input).input
         if step in (steps // 10, steps - 1):
             print(f"{step + 1:12,} steps: {resident() - first:.1f} MB", flush=True)
         x = plant.A @ x + plant.B @ u + plant.process_noise.sample(rng)

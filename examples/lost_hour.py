@@ -20,8 +20,9 @@ def run(contract: ChannelContract | None) -> None:
     loop.start(state + plant.initial_noise.sample(rng))
     packets, proved, violations, reason = [], 0, 0, ""
     for step in range(hour // 6 + hour + hour // 6):
+        loop.receive(packets)
         # Your controller goes here; this one is reckless.
-        decision = loop.step(plant.largest_input if step % 40 < 20 else -plant.largest_input, packets)
+        decision = loop.decide(plant.largest_input if step % 40 < 20 else -plant.largest_input)
         proved, reason = proved + loop.guaranteed, loop.reason or reason
         state = plant.A @ state + plant.B @ decision.input + plant.nominal_disturbance.sample_boundary(rng)
         violations += bool((plant.constraint_values(state) > 0.0).any())

@@ -290,6 +290,14 @@ safety_shield = shields.SafetyShield
 vector_shield = shields.VectorSafetyShield
 safety_filter = shields.SafetyFilter
 safe_loop = shields.SafeLoop
+
+
+def stepped(loop: Any, proposed: Any, packets: Any = (), **more: Any) -> Any:
+    """What a `SafeLoop` decides after it has received."""
+    loop.receive(packets, **more)
+    return loop.decide(proposed)
+
+
 # Certificates that are made here, of this method and of the published one.
 synthesize = shields.synthesize
 paper_synthesis = shields.paper.synthesize

@@ -12,7 +12,7 @@ from ncs_gym.envs.episode_channels import EpisodeChannels
 from ncs_gym.envs.loop import Loop, LoopState
 from ncs_gym.estimation.error_bound import ErrorSet
 from ncs_gym.estimation.estimator import Belief
-from ncs_gym.network.channel import Channel, ChannelContract, largest_age, require_on_request
+from ncs_gym.network.channel import Channel, ChannelContract, require_on_request
 from ncs_gym.network.downlink import DownlinkProtocol
 from ncs_gym.plants.linear_plant import LinearPlant
 from ncs_gym.processes.process import Process
@@ -40,7 +40,6 @@ class GuardedLoop:
     guard: Any = setting("guard")
 
     np_random: np.random.Generator  # of gymnasium
-    horizon: int
     _now: LoopState
     _task_random: Any = None
     _belief: Belief
@@ -97,19 +96,6 @@ class GuardedLoop:
         """
         found = require_on_request(self._now.requests).outstanding(self._now.estimator.age)
         return found if found.ndim else found.item()
-
-    @property
-    def request_state(self) -> np.ndarray:
-        """The age of the newest sample used, and `outstanding`, shape (2,) or (N, 2) [steps, samples]."""
-        return np.stack([self._now.estimator.age, self.outstanding], axis=-1)
-
-    @property
-    def request_limits(self) -> np.ndarray:
-        """Up to where `request_state` is told apart, shape (2,) [steps, samples]."""
-        input_delay, contract = self.downlink_protocol.input_delay, self.contract
-        oldest = largest_age(contract, self.horizon)
-        newer = oldest if contract else self.channel.longest_delay
-        return np.array([oldest, newer + input_delay], dtype=np.float64).clip(min=1.0)
 
     def _begin_draws_of_task(self, seed: int | None) -> None:
         """Gives the task a generator of its own, so that what it draws changes nothing in the loop."""

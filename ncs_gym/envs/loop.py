@@ -85,23 +85,13 @@ class Loop:
             )
         made = loop_contracts(plant, channel, self.contract, self.downlink, self.downlink_contract)
         contract, protocol, certificate_contract = made
-        values = {
-            "channel": channel,
-            "disturbance": disturbance,
-            "initial_set": initial_set,
-            "process": process,
-            "contract": contract,
-            "protocol": protocol,
-            "certificate_contract": certificate_contract,
-            "noise": as_noise(self.noise, plant),
-            "downlink_contract": None if self.downlink is None else protocol.contract,
-            "limits_the_way": len(plant.step_rows) > 0,
-            "oldest": largest_age(contract),
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        own, downlink_contract = vars(self), None if self.downlink is None else protocol.contract
+        own.update(channel=channel, disturbance=disturbance, initial_set=initial_set, process=process)
+        own.update(contract=contract, certificate_contract=certificate_contract, oldest=largest_age(contract))
+        own.update(protocol=protocol, downlink_contract=downlink_contract, noise=as_noise(self.noise, plant))
+        own.update(limits_the_way=len(plant.step_rows) > 0)
         histories = self.histories(channel)
-        object.__setattr__(self, "error_set", histories.recursion.error_set)
+        own.update(error_set=histories.recursion.error_set)
         if not histories.uses_samples:
             step = channel.quantization_step
             rounded = f", rounded to {step:g}" if step else ""

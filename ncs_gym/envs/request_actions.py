@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from ncs_gym.envs.env import NCSEnv
 from ncs_gym.envs.vector_env import NCSVectorEnv
+from ncs_gym.network.channel import largest_age
 from ncs_gym.validation import AroundEnvironments, as_number, as_numbers, require_batched_infos, shown
 
 
@@ -33,6 +34,11 @@ class _Requesting(RecordConstructorArgs):
         if not isinstance(self._inner, self._kind):
             raise ValueError(f"expected an {self._kind.__name__} inside, got {type(self._inner).__name__}")
         self._inner.request(False)  # raises where samples are sent by themselves
+        contract, input_delay = self._inner.contract, self._inner.downlink_protocol.input_delay
+        oldest = largest_age(contract, self._inner.horizon)
+        newer = oldest if contract else self._inner.channel.longest_delay
+        # Up to where age and number of the samples requested are told apart [steps, samples].
+        self._limits = np.array([oldest, newer + input_delay], dtype=np.float64).clip(min=1.0)
 
     @property
     def cost(self) -> float:
@@ -49,7 +55,7 @@ class _Requesting(RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         require_batched_infos(info, type(self).__name__)
         self._packets = np.copy(info["packets"])
-        return self._seen(observation), info
+        return self._seen(observation, info), info
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Asks for a sample where the last entry of the action is positive, and applies the others.
@@ -64,11 +70,12 @@ class _Requesting(RecordConstructorArgs):
         observation, reward, *ends, info = self.env.step(np.asarray(action)[..., :-1].copy())
         sent = np.maximum(info["packets"] - self._packets, 0)  # nothing in a step that only begins an episode
         self._packets = np.copy(info["packets"])
-        return self._seen(observation), reward - self.cost * sent, ends[0], ends[1], info
+        return self._seen(observation, info), reward - self.cost * sent, ends[0], ends[1], info
 
-    def _seen(self, observation: np.ndarray) -> np.ndarray:
-        more = np.minimum(self._inner.request_state, self._inner.request_limits)
-        return np.concatenate([observation, more], axis=-1).astype(self.observation_space.dtype)
+    def _seen(self, observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+        more = np.stack([info["measurement_age"], self._inner.outstanding], axis=-1)
+        entries = np.concatenate([observation, np.minimum(more, self._limits)], axis=-1)
+        return entries.astype(self.observation_space.dtype)
 
 
 class RequestActions(_Requesting, gym.Wrapper):
@@ -93,7 +100,7 @@ class RequestActions(_Requesting, gym.Wrapper):
     def __init__(self, env: gym.Env, cost: float = 0.0) -> None:
         super().__init__(env, cost)
         self.action_space = _wider(env.action_space, [-1.0], [1.0])
-        self.observation_space = _wider(env.observation_space, np.zeros(2), self._inner.request_limits)
+        self.observation_space = _wider(env.observation_space, np.zeros(2), self._limits)
 
 
 class VectorRequestActions(_Requesting, AroundEnvironments, VectorWrapper):
@@ -114,7 +121,7 @@ class VectorRequestActions(_Requesting, AroundEnvironments, VectorWrapper):
         if self._inner.autoreset_mode is AutoresetMode.SAME_STEP:
             raise ValueError("with SAME_STEP autoreset the age at an episode's end is not known: use NEXT_STEP")
         self.single_action_space = _wider(env.single_action_space, [-1.0], [1.0])
-        self.single_observation_space = _wider(env.single_observation_space, np.zeros(2), self._inner.request_limits)
+        self.single_observation_space = _wider(env.single_observation_space, np.zeros(2), self._limits)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 

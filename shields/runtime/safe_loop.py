@@ -277,23 +277,6 @@ class SafeLoop(CopiedWhole):
         requests = () if self._requests is None else tuple(self._requests.decided.tolist())
         return self._inputs.command(self.steps, self.episode, requests)
 
-    def step(
-        self,
-        proposed: Any,
-        packets: Iterable[Packet] = (),
-        applied: Any = None,
-        echoes: Iterable[Echo] = (),
-        *,
-        ask: bool = False,
-    ) -> Decision:
-        """Returns the decision at this control step: `receive`, then `decide`, for proposals that need no estimate.
-
-        Raises:
-            GuaranteeLostError: As from `receive`; `decide` is left then.
-        """
-        self.receive(packets, applied, echoes)
-        return self.decide(proposed, ask=ask)
-
     @property
     def request(self) -> bool:
         """Whether the sample of the next step is to be taken, after a decision: asked for, or needed by the contract.

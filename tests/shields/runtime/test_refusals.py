@@ -36,6 +36,7 @@ from shields.runtime.set_test import certified_root
 from tests import arrays
 from tests.certificates import certificate_of
 from tests.plants import small, with_remainder
+from tests.product import stepped
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANT, OTHER, CART = truck_trailer(mass=4000.0), truck_trailer(), cart_pole()
@@ -155,7 +156,7 @@ REFUSALS: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: loop_of(on_unproved="log"), ValueError, UNPROVED),
     (lambda: loop_of().receive(), RuntimeError, "call start"),
     (lambda: loop_of().decide(0.0), RuntimeError, "call start"),
-    (lambda: loop_of().step(0.0), RuntimeError, "call start"),
+    (lambda: loop_of().receive(), RuntimeError, "call start"),
     (lambda: Estimator(CART, KEPT), UnstablePlantError, r"error_set=certified_error_set\(plant, contract\)"),
     # What stands at the other end.
     (lambda: Actuator(1, 1, -1.0), ValueError, "u_max must be a size"),
@@ -208,7 +209,7 @@ def test_refused_call_of_a_loop_changes_nothing(decided, call, error, words):
     loop, twin = loop_of(), loop_of()
     for each in (loop, twin):
         each.start([0.01, 0.01])
-        each.step(0.1)
+        stepped(each, 0.1)
         each.receive([Packet(1, [0.01, 0.01])])
         if decided:
             each.decide(0.1)
