@@ -292,7 +292,7 @@ safety_filter = shields.SafetyFilter
 safe_loop = shields.SafeLoop
 
 
-def stepped(loop: Any, proposed: Any, packets: Any = (), **more: Any) -> Any:
+def loop_step(loop: Any, proposed: Any, packets: Any = (), **more: Any) -> Any:
     """What a `SafeLoop` decides after it has received."""
     loop.receive(packets, **more)
     return loop.decide(proposed)

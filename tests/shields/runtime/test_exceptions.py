@@ -12,7 +12,7 @@ from shields.runtime.guard import Guard
 from shields.runtime.safe_loop import NOT_STARTED
 from shields.runtime.set_test import ellipsoid_test
 from tests.certificates import certificate_of
-from tests.product import loop_env, safe_loop, safety_shield, stepped, vector_env, vector_shield
+from tests.product import loop_env, loop_step, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 MODES = ["project", "lookahead"]
@@ -84,7 +84,7 @@ class StopsWhoAsks:
 def test_exception_in_a_loop_stops_it_until_the_next_start(mode, name, monkeypatch):
     loop = safe_loop(certificate_of(PLANT), PLANT, Channel(delay=1), mode)
     loop.start(np.zeros(2))
-    stepped(loop, 0.1)
+    loop_step(loop, 0.1)
     loop.receive([Packet(1, np.zeros(2))])
     with pytest.raises(KeyboardInterrupt):
         loop.decide(StopsWhoAsks())
@@ -102,7 +102,7 @@ def test_exception_in_a_loop_stops_it_until_the_next_start(mode, name, monkeypat
         with pytest.raises(RuntimeError, match="call"):
             refused()
     loop.start(np.zeros(2))
-    assert stepped(loop, 0.1).proved
+    assert loop_step(loop, 0.1).proved
     assert loop.guaranteed
 
 

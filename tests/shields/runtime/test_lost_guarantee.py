@@ -10,7 +10,7 @@ from ncs_gym import Channel, truck_trailer
 from shields import GuaranteeLostError, GuaranteeLostWarning
 from shields.runtime.guard import NOT_KNOWN_INSIDE, OTHER_INPUT, OTHER_STEPS
 from tests.certificates import certificate_of
-from tests.product import loop_env, safe_loop, safety_shield, stepped, vector_env, vector_shield
+from tests.product import loop_env, loop_step, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 OUTSIDE = 0.99 / np.abs(PLANT.box).max(axis=0)
@@ -106,9 +106,10 @@ def test_loop_warns_its_caller_once_in_each_episode_of_each_reason():
 
     def episode():
         real.start(np.zeros(PLANT.n))
-        stepped(real, np.zeros(PLANT.m))
+        loop_step(real, np.zeros(PLANT.m))
         for _ in range(3):
-            stepped(real, np.zeros(PLANT.m), applied=PLANT.largest_input)
+            real.receive(applied=PLANT.largest_input)
+            real.decide(np.zeros(PLANT.m))
 
     for _ in range(2):
         (text, place), *others = said(episode)
@@ -127,10 +128,10 @@ def test_loop_takes_nothing_back_when_a_lost_guarantee_is_raised(kind):
         with pytest.raises(kind, match=NOT_KNOWN_INSIDE):
             real.start(OUTSIDE)
         real.start(np.zeros(PLANT.n))
-        stepped(real, np.zeros(PLANT.m))
+        loop_step(real, np.zeros(PLANT.m))
         with pytest.raises(kind, match=OTHER_INPUT):
             real.receive(applied=PLANT.largest_input)
         assert (real.steps, real.reason) == (1, OTHER_INPUT)
         assert real.estimate @ real.estimate > 0.0  # it has followed what was applied
         real.decide(np.zeros(PLANT.m))
-        stepped(real, np.zeros(PLANT.m))
+        loop_step(real, np.zeros(PLANT.m))

@@ -36,7 +36,7 @@ from shields.runtime.set_test import certified_root
 from tests import arrays
 from tests.certificates import certificate_of
 from tests.plants import small, with_remainder
-from tests.product import stepped
+from tests.product import loop_step
 
 CRUISE = "ncs_gym/TruckTrailerCruise-v0"
 PLANT, OTHER, CART = truck_trailer(mass=4000.0), truck_trailer(), cart_pole()
@@ -209,7 +209,7 @@ def test_refused_call_of_a_loop_changes_nothing(decided, call, error, words):
     loop, twin = loop_of(), loop_of()
     for each in (loop, twin):
         each.start([0.01, 0.01])
-        stepped(each, 0.1)
+        loop_step(each, 0.1)
         each.receive([Packet(1, [0.01, 0.01])])
         if decided:
             each.decide(0.1)

@@ -11,7 +11,7 @@ from ncs_gym import Channel, ChannelContract, Ellipsoid, Packet, cart_pole, truc
 from ncs_gym.network.channel import UnusedPacketsWarning
 from shields.runtime.guard import ALARM, NOT_FINITE, NOT_KNOWN_INSIDE, OTHER_INPUT
 from tests.certificates import certificate_of
-from tests.product import safe_loop, stepped
+from tests.product import loop_step, safe_loop
 
 # Plant, contract, channel.
 LOOPS = {
@@ -57,8 +57,8 @@ def test_another_input_than_decided_is_told_or_found_out(told):
 def test_missed_step_in_which_the_input_was_held_is_a_step(held, passes):
     loop = loop_of("truck")
     loop.start([1.5, 0.5])
-    stepped(loop, held)
-    decision = stepped(loop, held)  # for the step that the clock missed
+    loop_step(loop, held)
+    decision = loop_step(loop, held)  # for the step that the clock missed
     assert decision.intervened is not passes
     loop.receive(applied=held)
     assert (loop.steps, loop.reason) == (2, "" if passes else OTHER_INPUT)
@@ -104,21 +104,21 @@ def test_what_the_caller_keeps_is_its_own():
 def test_another_value_of_a_sample_ends_the_guarantee_whatever_comes_first(order, value):
     loop = started(channel=Channel(delay=3))
     for _ in range(3):
-        stepped(loop, np.zeros(1))
+        loop_step(loop, np.zeros(1))
     sample = Packet(2, loop.estimate)
     both = [sample, Packet(2, sample.measurement + value)]
-    stepped(loop, np.zeros(1), [sample, Packet(2, sample.measurement.copy())])
+    loop_step(loop, np.zeros(1), [sample, Packet(2, sample.measurement.copy())])
     assert loop.guaranteed
     loop.start(np.zeros(2))
     for _ in range(3):
-        stepped(loop, np.zeros(1))
+        loop_step(loop, np.zeros(1))
     both = [each._replace(episode=loop.episode) for each in both]
     if None in order:
-        stepped(loop, np.zeros(1), both[:1])
+        loop_step(loop, np.zeros(1), both[:1])
         assert loop.guaranteed
-        stepped(loop, np.zeros(1), both[1:])
+        loop_step(loop, np.zeros(1), both[1:])
     else:
-        stepped(loop, np.zeros(1), [both[which] for which in order])
+        loop_step(loop, np.zeros(1), [both[which] for which in order])
     assert loop.reason in (ALARM, NOT_FINITE)
 
 
@@ -132,15 +132,15 @@ def test_packet_of_an_earlier_episode_is_discarded_whatever_its_stamp(has_begun)
         loop.receive()
     loop.start([0.0, 0.0])
     assert loop.episode == 1
-    stepped(loop, 0.0)
-    stepped(loop, 0.0, [late])
+    loop_step(loop, 0.0)
+    loop_step(loop, 0.0, [late])
     assert loop.guaranteed
     assert loop.measurement_age == 1
-    stepped(
+    loop_step(
         loop, 0.0, [Packet(1, np.array([0.0, 0.0]), loop.episode)]
     )  # its own is used, although the other came first
     assert (loop.guaranteed, loop.measurement_age) == (True, 1)
-    stepped(loop, 0.0, [late._replace(episode=loop.episode, stamp=2)])
+    loop_step(loop, 0.0, [late._replace(episode=loop.episode, stamp=2)])
     assert loop.reason == ALARM
 
 
@@ -148,7 +148,7 @@ def test_step_is_receive_and_then_decide():
     one, two = started(channel=Channel()), started(channel=Channel())
     for step in range(20):
         packets = [Packet(step, [0.01, -0.01])]
-        decision = stepped(one, 1.0, packets)
+        decision = loop_step(one, 1.0, packets)
         two.receive(packets)
         np.testing.assert_equal(decision, two.decide(1.0))
     np.testing.assert_array_equal(one.estimate, two.estimate)
@@ -172,7 +172,7 @@ def test_sample_that_is_sent_after_a_decision_and_received_at_the_next_step_is_o
     arrived = []
     with pytest.warns(UnusedPacketsWarning, match="longest delay") if late else nullcontext():
         for step in range(21):
-            stepped(loop, 0.0, arrived)
+            loop_step(loop, 0.0, arrived)
             arrived = [Packet(step, np.zeros(2), loop.episode)]
     assert loop.discarded.too_late == late
     assert loop.measurement_age == (20 if late else 1)
@@ -183,12 +183,12 @@ def test_proposals_that_are_no_input_are_told_of_once_and_not_applied():
     gradient = torch.tensor([0.5], requires_grad=True)
     for proposed in (gradient, [gradient[0]], np.full((1, 1), 0.5), "full throttle", np.nan, np.array([np.inf])):
         loop = started(channel=Channel())
-        assert stepped(loop, None).reason == "invalid"  # a controller that failed is no mistake
+        assert loop_step(loop, None).reason == "invalid"  # a controller that failed is no mistake
         with pytest.warns(UserWarning, match=r"one input, finite numbers of shape \(1,\), got .*K x_hat is applied"):
-            decision = stepped(loop, proposed)
+            decision = loop_step(loop, proposed)
         assert decision.reason == "invalid"
         np.testing.assert_allclose(decision.input, loop.filter.certificate.K @ loop.estimate, atol=1e-6)
-        stepped(loop, proposed)
+        loop_step(loop, proposed)
 
 
 def test_copy_of_a_loop_shares_nothing_with_it():

@@ -13,7 +13,7 @@ from ncs_gym.network.channel import UnusedPacketsWarning
 from ncs_gym.processes.plant_step import PlantSimulation
 from shields.runtime.guard import NOT_FINITE
 from tests.certificates import certificate_of
-from tests.product import loop_env, safe_loop, safety_shield, stepped, vector_env, vector_shield
+from tests.product import loop_env, loop_step, safe_loop, safety_shield, vector_env, vector_shield
 
 PLANT = truck_trailer(mass=4000.0)
 
@@ -22,12 +22,12 @@ def test_every_reason_is_counted_and_named_once_and_apart():
     loop = safe_loop(certificate_of(PLANT), PLANT, Channel(delay=1))
     loop.start(np.zeros(2))
     for _ in range(4):
-        stepped(loop, 0.0)
+        loop_step(loop, 0.0)
     strays = [Packet(stamp, np.zeros(2)) for stamp in (1, 90, 2000)] + [Packet(4, np.zeros(2), 5)] * 3
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        stepped(loop, 0.0, strays)
-        stepped(loop, 0.0, strays)
+        loop_step(loop, 0.0, strays)
+        loop_step(loop, 0.0, strays)
     assert loop.discarded == (2, 4, 6)
     said = [str(warning.message) for warning in caught]
     assert len(said) == 3
