@@ -54,6 +54,9 @@ def _rows(
             for height, name in zip(range(len(names), 0, -1), names, strict=True):
                 if own := [each[name] for each in blocks.values() if name in each]:
                     draw(axis, styles[name], own, height)
+                else:
+                    place = {"transform": axis.get_yaxis_transform(), "ha": "center", "va": "center"}
+                    axis.text(0.5, height, "not trained", color="#555555", backgroundcolor="white", **place)
             axis.axhline(sum(name.startswith(("lqr", "mpc")) for name in names) + 0.5, color="#555555", lw=0.8)
             label(axis, quantity, "", task)
         axes[0, 0].set_yticks(range(len(names), 0, -1), names)
