@@ -607,7 +607,7 @@ def count_gains(env: NCSEnv, histories: ArrivalHistories) -> Counter[str]:
     def counted(number: int) -> tuple[np.ndarray, np.ndarray]:
         found = update(number)
         if number not in kinds:
-            kinds[number] = kind_of(found[0], table.statistics(number), histories.recursion, histories.recursion.R)
+            kinds[number] = kind_of(found[0], table.statistics(number), histories.recursion)
         counts[kinds[number]] += 1
         return found
 
@@ -615,10 +615,10 @@ def count_gains(env: NCSEnv, histories: ArrivalHistories) -> Counter[str]:
     return counts
 
 
-def kind_of(gain: np.ndarray, statistics: ErrorStatistics, recursion: ErrorRecursion, sensor: np.ndarray) -> str:
+def kind_of(gain: np.ndarray, statistics: ErrorStatistics, recursion: ErrorRecursion) -> str:
     """Returns which of the gains one is, by computing the others anew."""
     covariance, shape, age, _ = statistics
-    if np.allclose(gain, kalman_gain(recursion.plant, covariance, sensor), rtol=1e-9, atol=1e-12):
+    if np.allclose(gain, kalman_gain(recursion.plant, covariance, recursion.R), rtol=1e-9, atol=1e-12):
         return "Kalman"
     if np.array_equal(gain, recursion.sets.gain(shape)):
         return "set-membership"

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,11 @@ RANDOM, SAME_SET = 100, 1e-12
 EXACT = (
     *("A", "B", "H", "dt", "box", "box_ends", "input_ends", "mixed_rows", "mixed_ends", "gamma"),
     *("operating_state", "operating_input", "step_offset", "own_limits"),
-    *("input_middle", "input_half", "reach", "between_samples"),
+    *("input_middle", "input_half", "reach", "between_samples", "kept_ends", "step_rows", "within_step"),
+    *("process_noise.covariance", "sensor_noise.covariance", "initial_noise.covariance"),
 )
 SETS = (
-    *("disturbance", "allowed_disturbance", "nominal_disturbance", "nominal_sensor_error"),
+    *("disturbance", "allowed_disturbance", "nominal_disturbance", "sensor_error", "nominal_sensor_error"),
     *("initial_error", "nominal_initial_error"),
 )
 File = tyro.conf.Positional[Path]
@@ -66,7 +68,7 @@ def _is_same(one: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
 def numbers() -> Iterator[dict[str, np.ndarray]]:
     """Yields the numbers of each plant, by its name and theirs."""
     for name, plant in plants():
-        found = {key: np.array(getattr(plant, key), dtype=None) for key in EXACT}
+        found = {key: np.array(attrgetter(key)(plant), dtype=None) for key in EXACT}
         found = {key: np.array(str(each)) if each.dtype == object else each for key, each in found.items()}
         found |= {key: getattr(plant, key).shape_matrix for key in SETS}
         found["file"] = np.array(json.dumps(plant.document, sort_keys=True))

@@ -39,10 +39,10 @@ def complexity() -> None:
 
     Lines of the product, of benchmarks, examples and tests, and of templates and data (those of the report, tuned
     hyperparameters, JSON of the packages but for certificates and trained agents); branches that ask whether a feature
-    is there at all (`x is None` of a contract, a polytope, a remainder, a plan, a downlink, ages); which functions of
-    the product make an environment, its shield, and its first 200 steps behind it, in a process that has made nothing
-    yet; and their calls in one step, as it comes and behind a shield whose action passes, and how often the module
-    changes from one to the next.
+    is there at all (`x is None` of a contract, a polytope, a remainder, a plan, a downlink, ages); through how many
+    functions of the product making an environment, its shield, the first reset and the first 200 steps run, in a
+    process that has made nothing yet; and calls of them in one step, as it comes and behind a shield whose action
+    passes, and how often the module changes from one to the next.
     """
     product = sources(*PACKAGES)
     nodes = [node for path in product for node in ast.walk(ast.parse(path.read_text()))]
@@ -60,7 +60,7 @@ def complexity() -> None:
     }
     for name, part in parts.items():
         functions = functions_of(part)
-        total = sum(map(len_of, functions))
+        total = sum(map(line_count, functions))
         modules = len({code.co_filename for code in functions})
         print(f"{name}: {len(functions)} functions of {total:,} lines in {modules} modules")
     for name, env in {"a step": gym.make(case), "a shielded step": SafetyShield(gym.make(case))}.items():
@@ -135,7 +135,7 @@ def functions_of(run: Callable[[], Any]) -> set[CodeType]:
     return found
 
 
-def len_of(function: CodeType) -> int:
+def line_count(function: CodeType) -> int:
     """Returns how many lines a function has in its file, 0 if it has none."""
     return len(inspect.getsource(function).splitlines()) if Path(function.co_filename).exists() else 0
 

@@ -64,7 +64,7 @@ class Box(UncertainSet):
         return Box(np.full(size, self.low), np.full(size, self.high))
 
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:  # noqa: D102
-        return Through(np.eye(self.size or 1), self).ellipsoid()
+        return Ellipsoid(np.count_nonzero(self.half) * np.diag(np.atleast_1d(np.square(self.half))))
 
     def support(self, direction: np.ndarray) -> Any:  # noqa: D102
         return np.abs(direction) @ np.atleast_1d(self.half)
@@ -105,7 +105,7 @@ class Gaussian(UncertainSet):
 
 @dataclass(frozen=True, eq=False)
 class Through(UncertainSet):
-    """{E w : w in a box}, E of shape (n, q): half-widths or a `Box`; through E another set is `Ellipsoid(E P E')`."""
+    """{E w : w in a box}, E of shape (n, q): half-widths or a `Box`; another's shape or covariance is E P E'."""
 
     E: Any
     set: Any
@@ -114,11 +114,11 @@ class Through(UncertainSet):
         E = as_matrix(self.E, (None, None), "E of a set through E")
         own = as_set(self.set).sized(E.shape[1])
         if not isinstance(own, Box):
-            raise ValueError(f"Through takes half-widths or a Box, and of others Ellipsoid(E P E'), got {shown(own)}")
+            raise ValueError(f"Through takes half-widths or a Box; give others as E P E', got {shown(self.set)}")
         scaled = E * own.half
         if ((E != 0.0) & (own.half != 0.0) & (np.abs(scaled) < SMALLEST_SIZE)).any():
             raise ValueError(f"the entries of E diag(half-widths) must be 0 or at least {SMALLEST_SIZE:g} in size")
-        self._set(E=E, set=own, size=len(E), middle=E @ own.middle)
+        self._set(E=E, set=own, size=len(E), middle=exact.product(E, own.middle))
 
     def ellipsoid(self, weight: np.ndarray | None = None) -> Ellipsoid:
         """Returns the smallest one around, q E diag(h^2) E' with q the number of half-widths h > 0."""
@@ -185,8 +185,8 @@ def as_set(value: Any) -> Any:
         with suppress(TypeError):  # other entries than the set's
             return kinds[name](**content)
     half = as_setting(value)
-    if half is None or half.ndim > 1:
-        raise ValueError(f"a set must be a number, half-widths or one of {', '.join(kinds)}, got {shown(value)}")
+    if half is None or half.ndim > 1 or not (half >= 0.0).all():
+        raise ValueError(f"a set must be a number >= 0, half-widths or one of {', '.join(kinds)}, got {shown(value)}")
     return Box(-half, half)
 
 

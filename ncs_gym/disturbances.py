@@ -37,7 +37,7 @@ NOISES = ("truncated", "gaussian", "extreme")
 
 
 class Disturbance(Shared, ABC):
-    """A disturbance in the ball d'd <= `gamma` of a plant plus its `disturbance_bound`; process noise is added to it.
+    """A disturbance in the ball d'd <= `gamma` of a plant plus `of_disturbance.bound`; process noise is added to it.
 
     `begin` draws what stays fixed for an episode, `draw` the disturbance of one step; neither stores anything in the
     object, which any number of environments share. A subclass does not inherit the class attributes below.
@@ -83,7 +83,7 @@ class Disturbance(Shared, ABC):
 
 @dataclass(frozen=True, eq=False)
 class BallDisturbance(Disturbance):
-    """Uniform in the ball of squared radius gamma, plus uniform in the plant's `disturbance_bound`."""
+    """Uniform in the ball of squared radius gamma, plus uniform in its `of_disturbance.bound`."""
 
     vectorized: ClassVar[bool] = True
     memoryless: ClassVar[bool] = True
@@ -102,7 +102,7 @@ class BoxDisturbance(Disturbance):
     """Uniform in a box (Liu et al. Section 5).
 
     Attributes:
-        half_widths: Shape (n,), of a box in the ball d'd <= gamma plus the plant's `disturbance_bound`. None:
+        half_widths: Shape (n,), of a box in the ball d'd <= gamma plus its `of_disturbance.bound`. None:
             sqrt(gamma / n) each, plus uniform in the box inside that bound: where it was given by half-widths, these.
 
     Raises:
@@ -148,7 +148,7 @@ class BoxDisturbance(Disturbance):
 class SinusoidDisturbance(Disturbance):
     """a sin(2 pi k / period + phase), with a random extreme disturbance a and phase each episode.
 
-    a is a boundary point of the ball of squared radius gamma plus one of the plant's `disturbance_bound`.
+    a is a boundary point of the ball of squared radius gamma plus one of its `of_disturbance.bound`.
 
     Attributes:
         period: In steps.

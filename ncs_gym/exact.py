@@ -41,6 +41,8 @@ def pseudoinverse(rows: np.ndarray) -> np.ndarray:
     Raises:
         ZeroDivisionError: If its columns are not independent.
     """
+    if not rows.size:
+        return np.zeros(rows.T.shape)
     exact = _rational(rows)
     return _rounded((exact.transpose() * exact).inv() * exact.transpose())
 

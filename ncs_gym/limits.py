@@ -146,15 +146,16 @@ class LimitValues(ReadOnlyArrays):
 
         (n, m), A, B, rows = self.B.shape, self.A, self.B, self.box
         reach = 0.5 * np.ptp(self.input_ends, axis=0)
-        widths = np.sqrt(1.0 / np.diag(weight_of(rows, np.abs(E @ middle))))
+        pushed = reach_in_steps(A, B, self.largest_input, np.abs(E @ middle))
+        widths = np.sqrt(1.0 / np.diag(weight_of(rows, pushed)))
         balance = np.hstack([(np.eye(n) - A) * widths, -B * reach]) / widths[:, None]
         found = np.linalg.lstsq(balance, E @ middle / widths)[0]
         directions = null_space(balance)
         sizes = np.vstack([np.hstack([rows * widths, np.zeros((len(rows), m))]), np.eye(m, n + m, n)])
         found = found - directions @ np.linalg.lstsq(sizes @ directions, sizes @ found)[0]
         if not residual(A, B, E, widths * found[:n], reach * found[n:], middle)[1]:
-            pushed = shown((E @ middle).tolist())
-            raise ValueError(f"no state stays where it is under the middle of a disturbance, {pushed} per step")
+            each = shown((E @ middle).tolist())
+            raise ValueError(f"no state stays where it is under the middle of a disturbance, {each} per step")
         found = np.round(found, POINT_DECIMALS)
         x, u = widths * found[:n], reach * found[n:]
         return x, u, residual(A, B, E, x, u, middle)[0]
@@ -428,8 +429,8 @@ class Limits(ReadOnlyArrays):
         if widths is None or widths.shape not in ((), getattr(model, name).shape):
             return given
         if model.at is not None or not (widths > 0.0).all() or np.isinf(widths).all():
-            form = "positive half-widths, not all infinite, or a pair (low, high) of vectors, as beside at= of a Model"
-            raise ValueError(f"{name} limits must be {form}, got {shown(given)}")
+            form = "positive half-widths, not all infinite, or" if model.at is None else "absolute, beside at=(...):"
+            raise ValueError(f"{name} limits must be {form} (low, high) of vectors, got {shown(given)}")
         return -widths, widths
 
 

@@ -98,7 +98,7 @@ def _wrapped(text: str, indent: int) -> str:
 def _actions(plant: LinearPlant) -> str:
     rows = ["| entry | input | value at action 1 |", "|---|---|---|"]
     for index, name in enumerate(plant.input_names):
-        rows.append(f"| {index} | {name} | {_with_unit(plant.largest_input[index], plant.input_units, index)} |")
+        rows.append(f"| {index} | {name} | {_with_unit(plant.input_ends[1, index], plant.input_units, index)} |")
     return "\n".join(rows)
 
 

@@ -58,8 +58,8 @@ class NCSEnv(SpecOfJson, GuardedLoop, gym.Env[np.ndarray, np.ndarray]):
 
     ## Starting state
     Uniform in `initial_set`, or `options={"state": x0}`, in deviations from the operating point. The first estimate is
-    off by Gaussian noise (truncated unless `noise` says otherwise) and a uniform draw from the plant's `initial_bound`.
-    Other options of `reset` give the episode another channel, or another member of the plant's family.
+    off by Gaussian noise (truncated unless `noise` says otherwise) and a uniform draw from the plant's
+    `of_first_error.bound`. Other options of `reset` give the episode another channel, or another member of the family.
 
     ## Episode end
     Terminates on a violation of the safe box only with `terminate_on_violation`, or with an environment that is the

@@ -71,7 +71,7 @@ class EpisodeChannels:
         return each
 
     def choose(self, sources: list[Any] | None, rng: np.random.Generator, rows: Sequence[int]) -> dict[int, Any]:
-        """Returns the channels of the next episodes of some environments, by their indices; nothing has changed then.
+        """Returns the channels of the next episodes of some environments, by their indices; `begin` takes them.
 
         Args:
             sources: What `read` returned; None for the environments' own.
@@ -79,7 +79,7 @@ class EpisodeChannels:
             rows: Indices of these environments.
 
         Returns:
-            None of them where all have the declared one, as before.
+            An empty dictionary where all have the declared one, as before.
 
         Raises:
             ValueError: If what was drawn is no channel that the environments can have.

@@ -147,7 +147,7 @@ class LoopState(CopiedWhole, ABC):
         return sources, self.process.read_parameters(given.get("parameters"))
 
     def choose(self, sources: list[Any], rng: np.random.Generator, rows: Sequence[int] = (0,)) -> list[dict[int, Any]]:
-        """Returns the channels of the next episodes of some loops, up and down; nothing has changed then."""
+        """Returns the channels of the next episodes of some loops, up and down, as `begin` takes them."""
         return [links.choose(each, rng, rows) for links, each in zip(self.links.values(), sources, strict=True)]
 
     def _channel_infos(self) -> dict[str, Any]:

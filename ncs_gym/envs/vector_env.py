@@ -178,7 +178,13 @@ class NCSVectorEnv(SpecOfJson, GuardedLoop, VectorEnv):
             truncated |= self.steps >= self._max_episode_steps
         return self._observation(), reward, terminated, truncated, info
 
-    def _begin(self, mask: np.ndarray, starts: Any = None, fixed: Any = None, chosen: Any = None) -> Begun:
+    def _begin(
+        self,
+        mask: np.ndarray,
+        starts: np.ndarray | None = None,
+        fixed: np.ndarray | None = None,
+        chosen: list[dict[int, Any]] | None = None,
+    ) -> Begun:
         """Begins episodes; see `ManyLoops.begin`."""
         now = self._now
         now.begin(self.np_random, mask, starts, fixed, chosen)

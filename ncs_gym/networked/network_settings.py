@@ -152,8 +152,8 @@ class Entries:
         self._choices = np.empty(0, int), np.empty(0, int)
         if isinstance(actions, spaces.Discrete | spaces.MultiDiscrete):
             counts = np.ravel(actions.n if isinstance(actions, spaces.Discrete) else actions.nvec)
-            starts, each = np.ravel(actions.start).tolist(), counts.tolist()
-            values = [np.arange(first, first + n) for first, n in zip(starts, each, strict=True)]
+            pairs = zip(np.ravel(actions.start).tolist(), counts.tolist(), strict=True)
+            values = [np.arange(first, first + count) for first, count in pairs]
             self._choices = np.repeat(np.arange(len(counts)), counts), np.concatenate(values)
         made = {
             "age": lambda: spaces.Box(0.0, OLDEST_OBSERVED, (parts,), np.float32),
@@ -189,9 +189,9 @@ class Entries:
 
         Args:
             observation: What is seen of the environment, of N environments a batch.
-            age: Of the newest sample of each part, shape (parts,) or (N, parts) [steps].
+            age: Of the newest sample of each part, a list, or shape (N, parts) [steps].
             arrived: Whether one arrived, likewise.
-            pending: The pending actions, oldest first, shape (pending, ...) or (N, pending, ...), where asked for.
+            pending: The pending actions, oldest first, a sequence, or shape (N, pending, ...).
         """
         if not self.names:
             return observation
@@ -204,7 +204,7 @@ class Entries:
             else:
                 added[name] = self._told(np.array(pending))  # the network writes on into its own
         if self._is_flat:
-            shape = (*observation.shape[:-1], -1)
+            shape = (*np.shape(observation)[:-1], -1)
             flat = [each.reshape(shape) for each in added.values()]
             return np.concatenate([observation, *flat], axis=-1, dtype=self.space.dtype, casting="unsafe")  # type: ignore[call-overload]
         if isinstance(self._inner, spaces.Tuple):
@@ -333,6 +333,8 @@ class NetworkSettings:
             ValueError: If one is no channel, or of keys that observations do not have.
         """
         given, downlink = options.pop("channel", None), options.pop("downlink", None)
+        if self.keys is not None and isinstance(given, tuple | list) and len(given) == len(self.keys):
+            given = dict(zip(self.keys, given, strict=True))  # as for a `Tuple` of observations
         each = dict.fromkeys(self.keys or [None], given)
         if isinstance(given, Mapping) and self.keys is not None:
             if unknown := [key for key in given if key not in self.keys]:

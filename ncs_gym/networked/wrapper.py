@@ -338,7 +338,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper):
             self._begin(rows, observations)
         else:
             self._over = self._over & ~mask  # what is reset now begins no episode in the next step
-            self._begin_anew(rows, observations, chosen)
+            self._restart(rows, observations, chosen)
         return self._seen(), self._with_network(info)
 
     def _make(self, chosen: list[dict[int, Any]]) -> None:
@@ -358,7 +358,7 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper):
         self._steps, self._packets = np.zeros(count, np.int64), np.zeros(count, np.int64)
         self._over = np.zeros(count, np.bool_)
 
-    def _begin_anew(self, rows: np.ndarray, observations: np.ndarray, chosen: Any = None) -> None:
+    def _restart(self, rows: np.ndarray, observations: np.ndarray, chosen: Any = None) -> None:
         """Starts episodes where others ran before, whose packets are on their way; see `_begin` and `_make`."""
         rng, links = self.np_random, self._links.values()
         chosen = [each.choose(None, rng, rows.tolist()) for each in links] if chosen is None else chosen
@@ -407,13 +407,13 @@ class VectorNetworked(ReadNetwork, AroundEnvironments, VectorWrapper):
             sample[e] = info["final_obs"][e]
         self._packets += self._samples.exchange(rng, self._steps, sample, self._settings.parts[0].space)
         if len(rows := restarted.nonzero()[0]):
-            self._begin_anew(rows, sample)
+            self._restart(rows, sample)
         if ends_now:
             ended = info.get("final_info")
             final = self._with_network(ended if isinstance(ended, dict) else {})
             info = info | {"final_obs": self._seen(), "final_info": final}
             info.setdefault("_final_info", done)
-            self._begin_anew(np.flatnonzero(done), observations)
+            self._restart(np.flatnonzero(done), observations)
         self._over = done
         return self._seen(), rewards, terminated, truncated, self._with_network(info)
 

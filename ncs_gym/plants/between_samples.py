@@ -17,7 +17,7 @@ _MARGIN, _ROUNDING = 0.01, 1e-12
 
 
 def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
-    """Returns what follows for a plant whose box counts at N times of each step: `kept_ends` to `way_rows`.
+    """Returns `kept_ends`, `arriving` and all rows and ends within a step of a plant whose box counts at N times of it.
 
     With the input held, x(tau) = A_tau x + B_tau u + d_tau, where [A_tau, B_tau] is the upper part of exp(G tau) for
     G = [[Ac, Bc], [0, 0]]. A row c of the box is one on (x, u) at the times tau_i = i dt / N, of which the first is on
@@ -38,7 +38,7 @@ def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
         raise ValueError(f"between_samples needs {needed}: else nothing is known of times within a step")
     if exact.rank(plant.box[np.isfinite(plant.box_ends).all(axis=0)]) < plant.n:
         raise ValueError("between_samples needs Limits with two ends that bound every state: give generous ones")
-    points, n, m = plant.limits.between_samples or 1, plant.n, plant.m
+    points, n, m = plant.between_samples, plant.n, plant.m
     G, h = np.concatenate([plant.model.continuous, np.zeros((m, n + m))]), plant.dt / points
     box, W, size, D = np.pad(plant.box, ((0, 0), (0, m))), plant.reach, np.abs(G), plant.disturbance.shape_matrix
     try:
@@ -66,7 +66,7 @@ def kept_at_all_times(plant: LinearPlant) -> dict[str, np.ndarray]:
     shares = (np.arange(1, points) / points)[:, None, None]
     way = [rows[1:] - shares * (plant.box @ np.hstack([plant.A, plant.B])), np.tile(plant.box, (points - 1, 1, 1))]
     return {
-        "way_rows": read_only(np.concatenate([way[0], shares * way[1]], axis=2).reshape(-1, 2 * n + m)),
+        "within_step": read_only(np.concatenate([way[0], shares * way[1]], axis=2).reshape(-1, 2 * n + m)),
         "kept_ends": read_only(kept_ends),
         "arriving": read_only(rho),
         "step_rows": read_only(np.concatenate([plant.mixed_rows, *rows[1:]])),

@@ -388,7 +388,7 @@ def family(
 
 
 def _with_bound(plant: LinearPlant, bound: Ellipsoid | None) -> Bounds:
-    """Returns the bounds of a plant with another ellipsoid, (n, n), in place of its `disturbance_bound`."""
+    """Returns the bounds of a plant with another ellipsoid, (n, n), in place of its `of_disturbance.bound`."""
     kinds = Gaussian if plant.past else Ball | Gaussian
     kept = [each for each in plant.bounds.disturbance.parts if isinstance(each, kinds)]
     n = len(plant.model.A)

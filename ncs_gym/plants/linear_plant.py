@@ -67,15 +67,15 @@ class Source(NamedTuple):
             keeps_ball: Whether a `Ball` stands for itself, which it cannot beside past inputs.
 
         Raises:
-            ValueError: If a set with two different ends is added to others.
+            ValueError: If a set with two different ends is added to others than a Gaussian.
         """
         size, gaussian = len(weight), declared.gaussian
         covariance, delta = (gaussian.covariance, gaussian.delta) if gaussian else (np.zeros((size, size)), DELTA)
         noise = TruncatedGaussian(np.pad(covariance, (0, past)), truncation_energy(delta, size), past)
+        if len(declared.parts) > (2 if gaussian else 1) and pushes_of(declared.sized(size)):
+            raise ValueError("only a Gaussian stands beside a set with two different ends: give one Box around the sum")
         balls = [each for each in declared.parts if isinstance(each, Ball) and keeps_ball and not past]
         others = Sum(tuple(each for each in declared.parts if each is not gaussian and each not in balls)).sized(size)
-        if len(others.parts) > 1 and pushes_of(others):
-            raise ValueError("a set with two different ends is not added to others: give the sum as Through(E, Box)")
         shape = others.ellipsoid(weight).shape_matrix if others.parts else None
         bound = None if shape is None else Ellipsoid(np.pad(shape, (0, past)))
         return cls(float(np.square(sum(each.radius for each in balls))), noise, bound)
@@ -139,13 +139,13 @@ class LinearPlant(LimitValues):
         region: Digest of the model and the limits, which a remainder belongs to.
         fingerprint: SHA-256 over every number that proofs and simulations take of it, the same on every machine.
         state_names, state_units, input_names, input_units: The labels, with defaults.
-        dt, continuous_model, between_samples: Those of the model and the limits.
+        dt, between_samples: Those of the model and the limits.
         kept_ends: Ends of `box` that proofs keep at the sampling instants, shape (2, k): `box_ends`, or closer ones
             where the box counts between samples, too.
         arriving: rho of each row of the box, shape (k,): the part of that which is due to the disturbance of a step.
         step_rows, step_ends: Limits of (x, u) at the beginning of a step that proofs keep, shapes (g, n + m) and (2,
             g): the mixed ones, and rows of the box at the other times of the step, by time.
-        way_rows: Rows of the box at these times, given (x, u, x+) of a step, shape (g - q, 2 n + m).
+        within_step: Rows of the box at these times, given (x, u, x+) of a step, shape (g - q, 2 n + m).
         n, m, p: Number of states, inputs and outputs.
         of_disturbance, of_sensor, of_first_error: What is declared of each; other attributes name parts of these.
         remainder: What the model leaves out of the process that really moves; None if nothing.
@@ -178,7 +178,7 @@ class LinearPlant(LimitValues):
     arriving: np.ndarray = field(init=False)
     step_rows: np.ndarray = field(init=False)
     step_ends: np.ndarray = field(init=False)
-    way_rows: np.ndarray = field(init=False)
+    within_step: np.ndarray = field(init=False)
     delta: float = field(init=False)
     dt = setting("dt", "model.dt")
     between_samples = setting("between_samples", "limits.between_samples")
@@ -202,7 +202,7 @@ class LinearPlant(LimitValues):
         self._declare([declared, *sums[1:]], rest)
         self._name()
         self._set(kept_ends=self.box_ends, arriving=np.zeros(len(self.box)))
-        self._set(step_rows=self.mixed_rows, step_ends=self.mixed_ends, way_rows=np.empty((0, 2 * self.n + self.m)))
+        self._set(step_rows=self.mixed_rows, step_ends=self.mixed_ends, within_step=np.empty((0, 2 * self.n + self.m)))
         if self.between_samples is not None:
             self._set(**kept_at_all_times(self))
         if owned := [each.of_plant(self) for each in sums[0].parts if each.is_left_out]:
@@ -440,8 +440,8 @@ class LinearPlant(LimitValues):
         Shape (k + q,) or (k + q, N), for x, x+ of shape (n,) or (n, N) and the input that was held, (m,) or (m, N).
         """
         values = self.constraint_values(x_next)
-        if len(self.way_rows):
-            reached = self.way_rows.dot(np.concatenate([state, u, x_next])).reshape(-1, *values.shape)
+        if len(self.within_step):
+            reached = self.within_step.dot(np.concatenate([state, u, x_next])).reshape(-1, *values.shape)
             low, high = self.box_ends if values.ndim == 1 else self.box_ends[:, :, None]
             values = np.maximum(np.maximum(reached.max(axis=0) - high, low - reached.min(axis=0)), values)
         return np.concatenate([values, self.mixed_values(state, u)]) if len(self.mixed_rows) else values
@@ -478,12 +478,11 @@ def row_limit(plant: LinearPlant, j: int) -> str:
     if len(limited) == 1:
         size, unit = row[limited[0]], (plant.input_units + plant.state_units)[limited[0]]
     factors = [(row[i] / size, names[i]) for i in limited]
-    sizes = ["" if abs(each) == 1.0 else f"{abs(each):.4g} " for each, _ in factors]
-    terms = [f"{'-' if each < 0.0 else '+'} {size}{name}" for (each, name), size in zip(factors, sizes, strict=True)]
+    terms = [("- " if each < 0.0 else "+ ") + f"{abs(each):.4g} ".removeprefix("1 ") + name for each, name in factors]
     name = " ".join(terms).removeprefix("+ ")
     name = f"-{name[2:]}" if name.startswith("- ") else name
     (low, high), center = sorted((ends[:, j] / size).tolist()), float(row @ center / size)
-    center = 0.0 if abs(center) <= _ZERO * min(-low, high) else center
+    center *= abs(center) > _ZERO * max(end for end in (-low, high) if end < np.inf)
     if center == 0.0 and low == -high:
         return f"|{name}| <= {_sized(high, unit)}"
     point = f" (operating point {center:.6g})" if center else ""

@@ -89,8 +89,7 @@ def sampled_cart_pole() -> LinearPlant:
     """Returns the same model, found anew."""
     tangent = cart_pole()
     noise = NOISE * tangent.half_widths
-    limits, bounds = (
-        Limits(state=np.round(tangent.half_widths, 9), input=tangent.largest_input),
-        Bounds(noise, noise, noise),
+    limits = Limits(state=np.round(tangent.half_widths, 9), input=tangent.largest_input)
+    return linear_model(
+        CartPoleProcess(), limits, Bounds(noise, noise, noise), tangent.dt, labels=tangent.labels, samples=SAMPLES
     )
-    return linear_model(CartPoleProcess(), limits, bounds, tangent.dt, labels=tangent.labels, samples=SAMPLES)

@@ -88,8 +88,12 @@ def with_noise(
     return replace(plant, bounds=Bounds(disturbance=ball + process, sensor=sensor, first_error=first))
 
 
+# What the paper's theorems know of limits.
+SYMMETRIC = "limits |c_j x| <= 1 at samples and |u_i| <= u_max_i alone"
+
+
 def unknown_bounds(plant: LinearPlant) -> list[str]:
-    """Returns what a plant has of which the paper's theorems know nothing, as a user gave it."""
+    """Returns the declared bounds of a plant of which the paper's theorems know nothing, as a user gave them."""
     other = "another set in Bounds({}=...)".format
     declared = {
         other("disturbance"): plant.of_disturbance.bound,
@@ -97,8 +101,7 @@ def unknown_bounds(plant: LinearPlant) -> list[str]:
         other("sensor"): plant.of_sensor.bound,
         other("first_error"): plant.of_first_error.bound,
     }
-    others = [] if plant.is_symmetric else ["limits that are not |c_j x| <= 1 and |u_i| <= u_max_i alone"]
-    return others + [name for name, bound in declared.items() if bound is not None and np.any(bound.shape_matrix)]
+    return [name for name, bound in declared.items() if bound is not None and np.any(bound.shape_matrix)]
 
 
 class PaperModel:

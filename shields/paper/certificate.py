@@ -13,7 +13,7 @@ from ncs_gym import LinearPlant
 from ncs_gym.validation import ReadOnlyArrays, as_matrix, as_number
 from shields.certificate_text import counted, table
 from shields.errors import CertificateError
-from shields.paper.bounds import SMALLEST_GAP, PaperModel, unknown_bounds
+from shields.paper.bounds import SMALLEST_GAP, SYMMETRIC, PaperModel, unknown_bounds
 from shields.verification import Report
 from shields.verification.rational_matrix import (
     Condition,
@@ -91,7 +91,7 @@ def verify(certificate: PaperCertificate, plant: LinearPlant) -> Report:
     if not isinstance(certificate, PaperCertificate) or not isinstance(plant, LinearPlant):
         kinds = f"{type(certificate).__name__} and {type(plant).__name__}"
         raise ValueError(f"shields.paper.verify takes a PaperCertificate and a LinearPlant, got {kinds}")
-    belongs = flag("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
+    belongs = flag("plant: the certificate belongs to it", plant.digest() == certificate.fingerprint)
     return Report((belongs, *_conditions(certificate, plant)))
 
 
@@ -104,6 +104,9 @@ def _conditions(certificate: PaperCertificate, plant: LinearPlant) -> Iterator[C
     fits = certificate.L.shape == (plant.n, plant.n) and certificate.K.shape == (plant.m, plant.n)
     yield flag("shapes: L (n, n), K (m, n)", fits)
     if not fits:
+        return
+    if not plant.is_symmetric:
+        yield flag(f"limits: the paper's theorems know {SYMMETRIC}", False)
         return
     if unknown := unknown_bounds(plant):
         yield flag(f"bounds: the paper's theorems do not know {' and '.join(unknown)}", False)

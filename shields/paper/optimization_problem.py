@@ -13,7 +13,7 @@ import cvxpy as cp
 import numpy as np
 
 from ncs_gym import LinearPlant
-from shields.paper.bounds import PaperBounds
+from shields.paper.bounds import SYMMETRIC, PaperBounds
 from shields.synthesis.semidefinite_programs import largest_box_ellipsoid, value_of
 
 # In units of the safe box, a lambda_min(L) below this is the solver's inaccuracy.
@@ -46,13 +46,16 @@ class OptimizationProblem:
     The auxiliary matrix U is printed in units of alpha^2 / eps_up.
 
     Args:
-        plant: The plant with a bounded safe box; its uncertainty is not used.
+        plant: The plant with symmetric limits and a bounded safe box; its uncertainty is not used.
 
     Raises:
         Infeasible: If the solver fails to find the size of the safe box.
+        ValueError: If the limits are not symmetric.
     """
 
     def __init__(self, plant: LinearPlant) -> None:
+        if not plant.is_symmetric:
+            raise ValueError(f"the paper's method knows {SYMMETRIC}: use shields.synthesize")
         self._n, self._u_max = plant.n, plant.largest_input
         self._size = float(np.linalg.det(largest_box_ellipsoid(plant.box))) ** (0.5 / plant.n)
         self._A, self._B, self._C = plant.A, plant.B * plant.largest_input / self._size, plant.box * self._size

@@ -36,7 +36,7 @@ def synthesize(plant: LinearPlant, *, dkappa: float = 0.02, drho: float = 0.05) 
         raise ValueError(f"plant must be a LinearPlant, got {type(plant).__name__}")
     if unknown := unknown_bounds(plant):
         raise ValueError(
-            "the paper's method knows symmetric limits, a Ball of disturbances and Gaussians alone, not "
+            "the paper's method knows a Ball of disturbances and Gaussians alone, not "
             f"{' and '.join(unknown)}: use shields.synthesize"
         )
     free = plant.n - int(np.linalg.matrix_rank(plant.box))

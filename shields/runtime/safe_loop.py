@@ -235,7 +235,8 @@ class SafeLoop(CopiedWhole):
         """Returns what to apply from now until the next step, and why.
 
         Args:
-            proposed: Your controller's input, shape (m,) or a number if m = 1 [physical units]; clipped to the limits.
+            proposed: Your controller's input, shape (m,) or a number if m = 1 [physical units]; it is clipped to the
+                limits, and that is what counts as proposed.
                 What is no finite input is replaced by u = K x_hat, with a warning unless it is None.
             ask: Whether your controller asks for the sample of the next step, behind a downlink of c steps later, where
                 samples are on request.

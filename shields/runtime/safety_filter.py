@@ -44,7 +44,7 @@ class Decision(NamedTuple):
     S is the certificate's safe set, a polytope or an ellipsoid.
 
     Attributes:
-        input: Input to apply, shape (m,), within the limits; u_max times a float32 action if not the proposed one.
+        input: Input to apply, shape (m,), within the limits; that of a float32 action if not the proposed one.
         intervened: Whether it differs from the proposed one, so that `~intervened` is a mask of proposals that may act;
             in mode "monitor": whether that of "switch" would differ.
         proved: Whether the input to apply, not the proposed one, meets the one-step test, so that x+ is in S even if x

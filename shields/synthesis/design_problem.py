@@ -116,7 +116,10 @@ def design_problem(
 
     Raises:
         Infeasible: If the plant has no error set, or its safe box is flat.
+        ValueError: If its own limits are meant, which are not symmetric.
     """
+    if limits is None and not plant.is_symmetric:
+        raise ValueError("the limits of the plant are not symmetric: give those around a resting point")
     limits = SymmetricLimits(plant.box, plant.largest_input) if limits is None else limits
     _, sizes, directions = np.linalg.svd(limits.box_rows * plant.half_widths)
     flatness = float(sizes[0] / sizes[-1])

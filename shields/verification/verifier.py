@@ -60,7 +60,7 @@ def verify(certificate: Certificate, plant: LinearPlant) -> Report:
         ValueError: If an argument is of another kind.
     """
     _require_kinds(certificate, plant)
-    belongs = flag("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
+    belongs = flag("plant: the certificate belongs to it", plant.digest() == certificate.fingerprint)
     return Report((belongs, *certified_conditions(certificate, plant)))
 
 

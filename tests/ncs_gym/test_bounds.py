@@ -97,6 +97,11 @@ def test_supports_of_a_sum_add_up_and_its_middles_too():
         (lambda: Through(E, Remainder(Ellipsoid(np.eye(2)), True, "given")), "takes half-widths or a Box"),
         (lambda: Through(E, Sum(())), "takes half-widths or a Box"),
         (lambda: Sum(()).ellipsoid(), "a sum of no sets"),
+        (lambda: Bounds(-0.1, 0.1, 0.1), r"disturbance=...\): a set must be a number >= 0, .* got -0.1"),
+        (
+            lambda: Bounds(0.1, Through([[1.0] * 3], Box([1e16, 0.9, -1e16], [1e16, 1.1, -1e16])), 0.1),
+            "its middle at zero",
+        ),
         (lambda: Bounds(0.1, Box(0.0, 0.2), 0.1), r"Bounds\(sensor=...\) must have its middle at zero, got 0.1"),
         (lambda: Bounds(0.1, Through([[1.0]], Box(0.0, 0.2)) + Ball(0.1), 0.1), "must have its middle at zero"),
         (lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sums(3, 1), r"first_error=...\): a set in dimension 3 is needed"),

@@ -110,6 +110,25 @@ def test_what_the_point_lacks_of_rest_is_inside_where_large_pushes_cancel(seed):
     assert plant.disturbance.gauge([float(Ax + Bu + d - own) for Ax, Bu, d, own in terms]) <= 1.0
 
 
+@pytest.mark.filterwarnings("ignore::ncs_gym.limits.MovedOperatingPointWarning")
+@pytest.mark.parametrize("unit", [1e-9, 1e-3, 1e6])
+def test_a_free_state_rests_at_the_same_point_in_any_unit(unit):
+    def plant(size):
+        limits = Limits(([-np.inf, -size], [np.inf, size]), 1.0)
+        push = Box([-1e-3 * size, 0.099 * size], [1e-3 * size, 0.101 * size])
+        model = Model([[0.5, 1.0], [0.0, 0.5]], [[0.0], [0.1 * size]], None, 0.1)
+        return LinearPlant(model, limits, Bounds(push, 1e-3 * size, 1e-3 * size))
+
+    one, other = plant(1.0), plant(unit)
+    np.testing.assert_allclose(other.operating_state / unit, one.operating_state, rtol=1e-8)
+    np.testing.assert_allclose(other.disturbance.shape_matrix / unit**2, one.disturbance.shape_matrix, rtol=1e-6)
+
+
+def test_open_ends_alone_leave_the_reach_infinite():
+    plant = LinearPlant(MODEL, Limits((-np.ones(2), np.full(2, np.inf)), ([-1.0], [0.5])), BOUNDS)
+    assert plant.reach.tolist() == [np.inf, np.inf, 1.0]
+
+
 class Pair(NamedTuple):
     low: object
     high: object

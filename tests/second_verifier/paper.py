@@ -36,6 +36,14 @@ def paper_conditions(certificate: PaperCertificate, plant: LinearPlant) -> Itera
     yield is_so("shapes: L (n, n), K (m, n)", fits)
     if not fits:
         return
+    ends = np.concatenate([plant.box_ends, plant.input_ends / plant.input_ends[1]], axis=1)
+    if (
+        np.abs(ends).tolist() != np.ones_like(ends).tolist()
+        or len(plant.mixed_rows)
+        or plant.between_samples is not None
+    ):
+        yield is_so("limits: the paper's theorems know |c_j x| <= 1 and |u_i| <= u_max_i alone", False)
+        return
     for bound in (plant.of_disturbance.bound, plant.remainder_bound, plant.of_sensor.bound, plant.of_first_error.bound):
         if bound is not None and np.any(bound.shape_matrix):
             yield is_so("bounds: the paper's theorems know gamma and covariances alone", False)

@@ -21,7 +21,7 @@ def verify_again(certificate: Certificate | PaperCertificate, plant: LinearPlant
 
 
 def _conditions(certificate: Certificate | PaperCertificate, plant: LinearPlant) -> Iterator[Condition]:
-    yield is_so("plant: the certificate belongs to it", plant.fingerprint == certificate.fingerprint)
+    yield is_so("plant: the certificate belongs to it", plant.digest() == certificate.fingerprint)
     if isinstance(certificate, PaperCertificate):
         yield from paper_conditions(certificate, plant)
     else:

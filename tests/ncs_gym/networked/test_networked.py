@@ -118,6 +118,11 @@ def test_entries_are_what_infos_say_and_actions_are_those_decided():
         over = any(ends)
 
 
+def test_predictions_that_are_lists_get_their_entries_too():
+    env = Networked(Counter(), Channel(delay=2), observe="age", fill=lambda last, age, actions: [7.0])
+    assert [seen.tolist() for seen, *_ in run(env, 3)] == [[0.0, 0.0], [7.0, 1.0], [7.0, 2.0], [7.0, 2.0]]
+
+
 @pytest.mark.cases(6)
 @pytest.mark.parametrize(
     ("actions", "size"),
@@ -308,6 +313,8 @@ def test_channels_of_several_sensors_are_drawn_by_their_keys():
     assert delays(RandomChannel(inner, DELAYED)) == {(1, 1), (1, 3), (3, 1), (3, 3)}
     assert delays(RandomChannel(inner, DELAYED), channel={"b": Channel(delay=7)}) == {(1, 7), (3, 7)}
     assert delays(RandomChannel(inner, {"a": DELAYED}), channel=Channel(delay=4)) == {(4, 4)}
+    pair = Networked(Sampled(gym.spaces.Tuple(TWO_SENSORS.values())), (Channel(), Channel(delay=5)))
+    assert pair.reset(options={"channel": (Channel(delay=1), None)})[1]["channel_delay"] == {0: 1, 1: 5}
     for wrong in ({"c": DELAYED}, [NETWORK], {"a": Channel()}, {}):
         with pytest.raises(ValueError, match="channel"):
             RandomChannel(inner, wrong)

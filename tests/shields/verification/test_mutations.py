@@ -145,6 +145,17 @@ def test_provenance_proves_nothing_and_the_fingerprint_names_the_plant(name):
     assert broken(replace(certificate, fingerprint="0" * 64), plant) == ["plant: the certificate belongs to it"]
 
 
+@pytest.mark.parametrize("name", ["H", "operating_state"])
+def test_plant_that_was_altered_after_it_was_made_is_another_one(name):
+    """Without a contract no condition asks for these numbers."""
+    certificate, plant = case("ellipsoid")
+    plant = replace(plant)
+    object.__setattr__(plant, name, getattr(plant, name) + 1.0)
+    assert broken(certificate, plant) == ["plant: the certificate belongs to it"]
+    with pytest.raises(CertificateError, match="made for another plant"):
+        require_valid(certificate, plant)
+
+
 # Whole parts, of a certificate or of what a plant derives from its numbers, and the conditions that notice.
 
 
@@ -171,7 +182,7 @@ def replaced(plant, **values):
         source, part = sources[name]
         values[source] = getattr(plant, source)._replace(**{part: values.pop(name)})
     faulty = object.__new__(type(plant))
-    faulty.__dict__.update(plant.__dict__ | values)
+    faulty.__dict__.update(plant.__dict__ | {"digest": plant.digest} | values)
     if "remainder" in values:
         faulty.__dict__["remainder_bound"] = values["remainder"].bound
     return faulty
