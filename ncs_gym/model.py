@@ -85,7 +85,7 @@ class Model(ReadOnlyArrays):
         A = _square(self.A)
         n = len(A)
         B = as_matrix(self.B, (n, None), "B")
-        H = np.eye(n) if self.H is None else as_matrix(self.H, (None, n), "H")
+        H = np.eye(n) if self.H is None else as_matrix(self.H, (None, n), "H, with a row per output,")
         if (np.abs(H).max(axis=1) < SMALLEST_NUMBER).any():
             raise ValueError(f"every row of H must measure something, got {shown(H.tolist())}")
         at = (None, None) if self.at is None else self.at
