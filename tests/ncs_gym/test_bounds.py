@@ -15,6 +15,7 @@ from ncs_gym.disturbances import diagonal_inside
 from ncs_gym.plants.family import Remainder
 
 E = np.array([[1.0, 0.5], [0.0, 2.0], [0.3, 0.0]])
+LEFT_OUT = Remainder(Ellipsoid(np.eye(2)), True, "given")
 SETS = {
     "half-widths": as_set([0.1, 2.0, 0.0]),
     "number": as_set(0.3),
@@ -94,7 +95,7 @@ def test_supports_of_a_sum_add_up_and_its_middles_too():
         *((partial(as_set, given), "a set must be") for given in ([[1.0, 1.0], [1.0, 2.0]], {"Box": {"low": 0.0}})),
         (lambda: Bounds(0.1, "a", 0.0), r"Bounds\(sensor=...\): a set must be"),
         (lambda: Through(E, Ball(0.1)), "takes half-widths or a Box"),
-        (lambda: Through(E, Remainder(Ellipsoid(np.eye(2)), True, "given")), "takes half-widths or a Box"),
+        (lambda: Through(E, LEFT_OUT), "takes half-widths or a Box"),
         (lambda: Through(E, Sum(())), "takes half-widths or a Box"),
         (lambda: Sum(()).ellipsoid(), "a sum of no sets"),
         (lambda: Bounds(-0.1, 0.1, 0.1), r"disturbance=...\): a set must be a number >= 0, .* got -0.1"),
@@ -104,6 +105,8 @@ def test_supports_of_a_sum_add_up_and_its_middles_too():
         ),
         (lambda: Bounds(0.1, Box(0.0, 0.2), 0.1), r"Bounds\(sensor=...\) must have its middle at zero, got 0.1"),
         (lambda: Bounds(0.1, Through([[1.0]], Box(0.0, 0.2)) + Ball(0.1), 0.1), "must have its middle at zero"),
+        (lambda: Bounds(0.1, LEFT_OUT, 0.1).sums(2, 2), "may have one remainder, and others none"),
+        (lambda: Bounds(LEFT_OUT + LEFT_OUT, 0.1, 0.1).sums(2, 2), "may have one remainder, and others none"),
         (lambda: Bounds(0.1, 0.1, [0.1, 0.2]).sums(3, 1), r"first_error=...\): a set in dimension 3 is needed"),
     ],
 )
