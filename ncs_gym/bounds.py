@@ -45,13 +45,13 @@ class Box(UncertainSet):
     def __post_init__(self) -> None:
         given: Any = self.low, self.high
         ends: list[Any] = [*map(as_setting, given)]
-        fits = all(each is not None and each.ndim <= 1 and each.size and np.isfinite(each).all() for each in ends)
+        fits = all(e is not None and e.ndim <= 1 and e.size and (np.abs(e) <= LARGEST_SIZE).all() for e in ends)
         fits = fits and len({*map(np.shape, ends)} - {()}) <= 1
         low, high = np.array(np.broadcast_arrays(*ends)) if fits else np.array([1.0, 0.0])
         self._set(low=low, high=high, middle=0.5 * (high + low), size=low.size if low.ndim else None)
-        if not ((self.half == 0.0) | (self.half >= SMALLEST_SIZE) & (self.half <= LARGEST_SIZE)).all():
-            form = f"low <= high of one size, half-widths being 0 or from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
-            raise ValueError(f"a box needs two finite ends, {form}, got {shown(given)}")
+        if not ((self.half == 0.0) | (self.half >= SMALLEST_SIZE)).all():
+            form = f"low <= high of one size, within {LARGEST_SIZE:g} of 0, half-widths 0 or at least {SMALLEST_SIZE:g}"
+            raise ValueError(f"a box needs two ends, {form}, got {shown(given)}")
 
     @cached_property
     def half(self) -> np.ndarray:

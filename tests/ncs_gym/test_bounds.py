@@ -85,7 +85,8 @@ def test_supports_of_a_sum_add_up_and_its_middles_too():
     [
         (lambda: Box([0.0, 1.0], [1.0]), r"of one size, .* got \(\[0.0, 1.0\], \[1.0\]\)"),
         (lambda: Box(1.0, 0.0), "low <= high"),
-        (lambda: as_set(np.inf), "two finite ends"),
+        (lambda: as_set(np.inf), "a box needs two ends, low <= high of one size, within 1e.37 of 0"),
+        (lambda: Box(1e299, 1e299), "within 1e.37 of 0"),
         (lambda: Ball(-1.0), "the radius of a ball must be a number >= 0"),
         (lambda: Gaussian([[1.0, 2.0], [2.0, 1.0]], 0.1), "positive semidefinite"),
         (lambda: Through(E, [0.1, 0.2, 0.3]), "dimension 2 is needed, got one in dimension 3"),
