@@ -124,8 +124,13 @@ def stiff(speed, points=64):
     return sampled_plant(model, dt=0.1, box=[1.0, 1.0], u_max=1.0, between_samples=points, **bounds)
 
 
+def test_a_state_that_is_too_fast_between_the_times_is_refused():
+    with pytest.raises(ValueError, match="leaves nothing of row 2 of the box"):
+        stiff(1e5)
+
+
 @pytest.mark.cases(1)
-@pytest.mark.parametrize("speed", [3.0, 300.0, 1e5])
+@pytest.mark.parametrize("speed", [3.0, 300.0])
 def test_rows_of_stiff_models_are_right_and_hardly_closer_than_they_have_to_be(speed):
     """The plant's own eta is one percent more than needed."""
     plant = stiff(speed)

@@ -130,7 +130,7 @@ def test_predictive_filter_finds_the_closest_input_with_a_nominal_plan(kind, cer
     rng, found = np.random.default_rng(3), 0
     first, second = (each.ravel()[:, None] for each in np.meshgrid(grid, grid, indexing="ij"))
     (low, high), widths = plant.own_limits, plant.half_widths
-    for _ in range(40):
+    for _ in range(80):
         estimate = rng.uniform(low - 0.3 * widths, high + 0.3 * widths)
         proposed = rng.uniform(*plant.input_ends)
         one = plant.A @ estimate + first @ plant.B.T

@@ -74,7 +74,7 @@ def test_c_does_what_its_python_reading_does(exported, name, single):
     (folder, table), (plant, certificate) = exported(name, single), example(name)
     rng, h, seen = np.random.default_rng(1), certificate.contract.max_age, set()
     board = Boards(folder, 1, plant.n, plant.m)
-    for episode in range(12):
+    for episode in range(24):
         first = rng.uniform(-1.0, 1.0, plant.n) * plant.half_widths * [0.0, 0.2, 1.5, 200.0][episode % 4]
         reading, states = BoardFilter(table, episode, first), [first]
         assert board.start(episode, first[None])

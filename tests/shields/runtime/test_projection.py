@@ -68,7 +68,7 @@ def random_case(rng, m):
 def test_projection_agrees_with_a_conic_solver_in_random_cases(m):
     rng = np.random.default_rng(m)
     compared = bound = failed = 0
-    for _ in range(400):
+    for _ in range(600):
         wanted, offset, effect, radius, limit = random_case(rng, m)
         found = closest_admissible(wanted, offset, effect, radius, limit)
         try:
