@@ -103,8 +103,7 @@ class Networked(ReadNetwork, gym.Wrapper):
         self._network: Any = None  # what infos say of it in this episode
         self._arrivals = [_Arrivals() for _ in settings.parts]
         self._sees_newest = settings.keys is None and settings.fill == "last" and not settings.entries.names
-        self._observes_actions = "pending_actions" in settings.entries.names
-        self._keeps_actions = self._observes_actions or callable(settings.fill)
+        self._keeps_actions = "pending_actions" in settings.entries.names or callable(settings.fill)
 
     @property
     def episode_channel(self) -> Any:
